@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every setting, once: default, range, unit and meaning. Frozen; a typo in a name is an error.
+
+`Config()` is the default; `Config.preset(name)` the named ones; `config.replace({"lifting.stride": 4})` a changed copy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from garps_core.errors import ConfigError
+
+
+def setting(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated."""
+    return field(default=default, metadata={"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices})
+
+
+class _Checked:
+    """Checks every field of a settings dataclass against its own description."""
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            value, limits = getattr(self, f.name), f.metadata
+            name = f"{type(self).__name__.lower()}.{f.name}"
+            if limits.get("choices") and value not in limits["choices"]:
+                raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
+            if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
+                _check_number(name, value, f.default, limits)
+
+
+def _check_number(name: str, value: Any, default: float, limits: Mapping[str, Any]) -> None:
+    kinds = (int,) if isinstance(default, int) else (int, float)
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        raise ConfigError(f"{name} is {value!r}: expected {'an integer' if kinds == (int,) else 'a number'}")
+    low, high = limits.get("low"), limits.get("high")
+    if not (value == value and (low is None or value >= low) and (high is None or value <= high)):
+        raise ConfigError(f"{name} is {value}: expected between {low} and {high} {limits.get('unit', '')}".rstrip())
+
+
+@dataclass(frozen=True)
+class Lifting(_Checked):
+    """How a pixel with depth becomes a Gaussian (`reconstruct`)."""
+
+    stride: int = setting(2, "use every n-th pixel in both image directions", unit="px", low=1, high=32)
+    noise_floor_m: float = setting(1e-3, "depth noise sigma at zero range", unit="m", low=0, high=1)
+    noise_linear: float = setting(2e-3, "depth noise sigma per metre of range", unit="m/m", low=0, high=1)
+    noise_quadratic_per_m: float = setting(
+        0.0, "depth noise sigma per square metre of range (triangulating sensors)", unit="1/m", low=0, high=0.1
+    )
+    edge_ratio: float = setting(
+        0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
+    )
+    min_cosine: float = setting(
+        0.15, "surfaces seen flatter than this cosine are treated as seen at it", unit="", low=0.01, high=1
+    )
+    min_range_m: float = setting(0.1, "ignore depth below", unit="m", low=0, high=100)
+    max_range_m: float = setting(20.0, "ignore depth beyond", unit="m", low=0.1, high=1000)
+    smoothing_px: int = setting(5, "diameter of the edge-keeping depth filter, 0 = off", unit="px", low=0, high=15)
+    footprint: float = setting(0.5, "sigma of the footprint in pixel spacings", unit="px/px", low=0.05, high=5)
+    weighting: str = setting(
+        "area", "component weights: surface area seen, or one per pixel", choices=("area", "equal")
+    )
+
+
+@dataclass(frozen=True)
+class Start(_Checked):
+    """Where the alignment starts (`initialise`)."""
+
+    method: str = setting(
+        "auto",
+        "auto = the given prior, else features, else identity when `identity_fallback`",
+        choices=("auto", "features", "identity"),
+    )
+    max_features: int = setting(2000, "SIFT features per image", low=50, high=20000)
+    match_ratio: float = setting(0.8, "ratio test of the feature matches", unit="", low=0.1, high=1)
+    ransac_px: float = setting(3.0, "inlier threshold of the pose estimate", unit="px", low=0.1, high=50)
+    min_inliers: int = setting(12, "fewer inliers than this is no pose", low=4, high=10000)
+    covariance_inflation: float = setting(
+        1.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
+    )
+    identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
+    identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
+    identity_sigma_rad: float = setting(0.2, "sigma of the identity start, rotation", unit="rad", low=1e-4, high=3)
+
+
+@dataclass(frozen=True)
+class Rung(_Checked):
+    """One step of the annealing ladder."""
+
+    covariance_scale: float = setting(1.0, "multiplies every component covariance", low=1e-3, high=1e4)
+    components: int = setting(4000, "components used per view", low=50, high=1_000_000)
+    neighbours: int = setting(10, "nearest neighbours per component", low=1, high=200)
+    steps: int = setting(5, "solver steps at most", low=1, high=100_000)
+
+
+@dataclass(frozen=True)
+class Alignment(_Checked):
+    """The objective and how it is maximised (`align_mixtures`)."""
+
+    solver: str = setting(
+        "second_order",
+        "second_order = annealed maximum a posteriori; adam = the paper's method",
+        choices=("second_order", "adam"),
+    )
+    ladder: tuple[Rung, ...] = (
+        Rung(30.0, 2000, 12, 6),
+        Rung(10.0, 3000, 10, 6),
+        Rung(3.0, 4000, 10, 6),
+        Rung(1.0, 6000, 10, 6),
+    )
+    colour_variance: float = setting(0.05, "variance of each colour channel (0..1)", unit="", low=1e-4, high=100)
+    semantic_discount: float = setting(0.92, "weight of a pair with different labels", unit="", low=0, high=1)
+    outlier_floor: float = setting(
+        0.01, "outlier density, in densities of one perfect partner", unit="", low=0, high=10
+    )
+    max_distance_m: float = setting(2.5, "partners further apart are ignored", unit="m", low=1e-3, high=1000)
+    occlusion_ratio: float = setting(
+        0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
+    )
+    information: float = setting(
+        150.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
+    )
+    tolerance: float = setting(1e-4, "a step smaller than this share of its sigma is converged", low=1e-9, high=1)
+    min_overlap: float = setting(0.1, "smaller overlap is refused", unit="", low=0, high=1)
+    opacity_threshold: float = setting(0.0, "drop components of smaller weight", low=0, high=1)
+    adam_rate_translation: float = setting(9e-5, "Adam's rate for the translation", unit="m", low=0, high=1)
+    adam_rate_rotation: float = setting(3e-6, "Adam's rate for the quaternion", unit="", low=0, high=1)
+
+
+@dataclass(frozen=True)
+class Config(_Checked):
+    """All settings. See the parts for their fields."""
+
+    lifting: Lifting = Lifting()
+    start: Start = Start()
+    alignment: Alignment = Alignment()
+    device: str = setting("cpu", "where the objective runs: cpu, cuda, cuda:0 ...")
+    dtype: str = setting("float32", "arithmetic of the objective", choices=("float32", "float64"))
+    seed: int = setting(0, "seed of the robust estimators", low=0, high=2**31 - 1)
+
+    @classmethod
+    def preset(cls, name: str) -> Config:
+        """A named configuration: "default", "sensor", "monocular" or "paper". Raises ConfigError on another name."""
+        presets = {"default": cls, "sensor": cls, "monocular": _monocular, "paper": _paper}
+        if name not in presets:
+            raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(presets)}")
+        return presets[name]()
+
+    def replace(self, changes: Mapping[str, Any]) -> Config:
+        """A copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Raises ConfigError on a typo."""
+        config: Config = self
+        for name, value in changes.items():
+            config = _replaced(config, name, name.split("."), value)
+        return config
+
+    def settings(self) -> dict[str, Any]:
+        """Every setting by dotted name, in order of definition."""
+        return dict(_flatten("", self))
+
+
+def _flatten(prefix: str, part: Any) -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for f in dataclasses.fields(part):
+        value = getattr(part, f.name)
+        name = prefix + f.name
+        rows += _flatten(name + ".", value) if isinstance(value, (Lifting, Start, Alignment)) else [(name, value)]
+    return rows
+
+
+def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
+    names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
+    if path[0] not in names:
+        near = difflib.get_close_matches(name, list(Config().settings()), n=1, cutoff=0.4)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ConfigError(f"setting {name!r} does not exist{hint}")
+    if len(path) > 1:
+        value = _replaced(getattr(part, path[0]), name, path[1:], value)
+    return dataclasses.replace(part, **{path[0]: value})
+
+
+def _monocular() -> Config:
+    """Metric depth from one image: right to a few per cent in scale and shape, so long along each ray."""
+    return Config(
+        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, smoothing_px=0),
+        alignment=Alignment(colour_variance=0.02),
+    )
+
+
+def _paper() -> Config:
+    """Li and Campbell, GARPS: the published objective, hyperparameters and optimiser."""
+    return Config(
+        lifting=Lifting(weighting="equal"),
+        alignment=Alignment(
+            solver="adam",
+            ladder=(Rung(90.0, 1_000_000, 30, 1000),),
+            colour_variance=0.4,
+            opacity_threshold=0.5,
+        ),
+    )

@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every error this package raises on purpose. Each text says what was given, what was expected, what to do."""
+
+
+class GarpsError(Exception):
+    """Base of all errors raised on purpose; catching it never hides a programming mistake."""
+
+
+class InputError(GarpsError, ValueError):
+    """An image, calibration, prior or mixture that cannot be what it claims to be."""
+
+
+class ConfigError(GarpsError, ValueError):
+    """A setting that does not exist, or a value outside its range."""
+
+
+class ReconstructionError(GarpsError):
+    """A view that is well formed but holds too little depth to become a mixture."""
