@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The alignment objective, its gradient and its curvature in closed form, over a sparse set of pairs.
+
+For rows i (components of one mixture, moved by T = (R, t)) and their partners j in the other mixture
+
+    g_ij = w_ij phi_j |S|^-1/2 exp(-d' S^-1 d / 2),   d = R mu_i + t - mu_j,   S = R S_i R' + S_j
+    s_i  = sum_j g_ij
+
+two objectives are offered. "sum" is the paper's: log sum_i phi_i s_i (its eq. 5; the logarithm keeps the optimum).
+"log" is sum_i phi_i log(1 + s_i / o_i): o_i is the density of an outlier, so that one row has a bounded say.
+
+With u = S^-1 d, over a left twist (v, w) of T (derived in docs/objective.md):
+
+    d log g / dv = -u
+    d log g / dw = -(mu' x u) + vee(S_i' (u u' - S^-1))        mu' = R mu_i + t,  S_i' = R S_i R'
+    information  = sum r_ij J' S^-1 J,  J = [I, -[mu']x]        (Gauss-Newton, responsibilities r_ij held fixed)
+
+Every term is linear in per-row sums over partners of g, g u, g S^-1 and g u u': the pair loop needs no 3x3 arrays,
+only sixteen scalars, laid out as (k, n) planes so that a row's values are implied by position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from garps_core.geometry import Array
+
+CHUNK_PAIRS = 1 << 15
+"""Pairs handled at a time: sixteen float32 planes of this size stay in a CPU core's second-level cache."""
+CHUNK_PAIRS_CUDA = 1 << 22
+SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Order of the six distinct elements of a symmetric 3x3 matrix."""
+_FULL = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5])
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Rows of one mixture with k candidate partners each in the other mixture.
+
+    means (n, 3) and covariances (n, 6) of the rows in their own frame; weights (n,) summing to 1; log_floor (n,);
+    partner_means (3, k, n), partner_covariances (6, k, n), log_weights (k, n): log(w_ij phi_j), -inf = no partner.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    weights: Tensor
+    log_floor: Tensor
+    partner_means: Tensor
+    partner_covariances: Tensor
+    log_weights: Tensor
+
+    @property
+    def count(self) -> int:
+        """Number of candidate pairs, n * k."""
+        return self.log_weights.numel()
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Value, gradient (6,) and Gauss-Newton information (6, 6) over a left twist (v m, w rad), float64."""
+
+    value: float
+    gradient: Array
+    information: Array
+    observed: Array
+    """Information less what the uncertain assignment of partners takes away; may be indefinite far from an optimum."""
+    support: float
+    """Weighted share of rows whose partners outweigh the outlier density ("log"), else 1."""
+
+
+def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
+    """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
+    rows = _row_sums(pairs, T)
+    s, U, Q, A, moved, rotated = rows
+    weights = pairs.weights.double()
+    if form == "log":
+        ratio = s
+        value = float((weights * torch.log1p(ratio)).sum())
+        c = weights / (1 + ratio)
+        support = float((weights * (ratio / (1 + ratio))).sum())
+    else:
+        total = (weights * s).sum()
+        value = float(torch.log(total)) if float(total) > 0 else -np.inf
+        c = weights / total.clamp_min(1e-300)
+        support = 1.0
+    return Evaluation(value, *_combine(c, U, Q, A, moved, rotated, weights if form == "log" else None), support)
+
+
+def _row_sums(pairs: Pairs, T: Array) -> tuple[Tensor, ...]:
+    """Per-row sums over partners of g, g u, g S^-1, g u u' (n, ...), then mu' and S' of the rows; float64."""
+    like = pairs.means
+    R = torch.as_tensor(T[:3, :3], dtype=like.dtype, device=like.device)
+    t = torch.as_tensor(T[:3, 3], dtype=like.dtype, device=like.device)
+    moved = like @ R.T + t
+    rotated = R @ unpack(pairs.covariances) @ R.T
+    planes_S = pack(rotated).T.contiguous()
+    planes_mu = moved.T.contiguous()
+    n, k = len(like), pairs.log_weights.shape[0]
+    chunk = max(1, (CHUNK_PAIRS_CUDA if like.is_cuda else CHUNK_PAIRS) // max(k, 1))
+    parts = [_chunk_sums(pairs, planes_mu, planes_S, slice(b, b + chunk)) for b in range(0, n, chunk)]
+    sums = torch.cat(parts, dim=1).double()
+    s, U, Q, A = sums[0], sums[1:4].T, sums[4:10].T, sums[10:16].T
+    return s, U, unpack(Q), unpack(A), moved.double(), rotated.double()
+
+
+def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
+    """Sixteen per-row sums (16, chunk) for one chunk of rows. Divided by the row's floor, in log space."""
+    y = pairs.partner_means[:, :, rows]
+    S = pairs.partner_covariances[:, :, rows]
+    d0, d1, d2 = mu[0, rows] - y[0], mu[1, rows] - y[1], mu[2, rows] - y[2]
+    a, b, c, e, f, i = (S_row[m, rows] + S[m] for m in range(6))
+    # inverse of [[a, b, c], [b, e, f], [c, f, i]] by cofactors
+    p0, p1, p2 = e * i - f * f, c * f - b * i, b * f - c * e
+    det = a * p0 + b * p1 + c * p2
+    r = det.reciprocal()
+    p3, p4, p5 = (a * i - c * c).mul_(r), (b * c - a * f).mul_(r), (a * e - b * b).mul_(r)
+    p0, p1, p2 = p0.mul_(r), p1.mul_(r), p2.mul_(r)
+    u0 = p0 * d0 + p1 * d1 + p2 * d2
+    u1 = p1 * d0 + p3 * d1 + p4 * d2
+    u2 = p2 * d0 + p4 * d1 + p5 * d2
+    D = d0.mul_(u0).add_(d1.mul_(u1)).add_(d2.mul_(u2))
+    g = (pairs.log_weights[:, rows] - pairs.log_floor[rows] - 0.5 * (D + torch.log(det))).exp_()
+    g0, g1, g2 = g * u0, g * u1, g * u2
+    planes = (
+        g, g0, g1, g2,
+        p0.mul_(g), p1.mul_(g), p2.mul_(g), p3.mul_(g), p4.mul_(g), p5.mul_(g),
+        g0 * u0, g0 * u1, g0 * u2, g1 * u1, g1 * u2, g2 * u2,
+    )  # fmt: skip
+    return torch.stack([plane.sum(0) for plane in planes])
+
+
+def _combine(
+    c: Tensor, U: Tensor, Q: Tensor, A: Tensor, moved: Tensor, rotated: Tensor, weights: Tensor | None
+) -> tuple[Array, Array, Array]:
+    """Gradient, Gauss-Newton and observed information from row sums; c (n,) = d objective / d s_i."""
+    cU, cQ, cA = U * c[:, None], Q * c[:, None, None], A * c[:, None, None]
+    M = rotated @ (cA - cQ)
+    vee = torch.stack([M[:, 1, 2] - M[:, 2, 1], M[:, 2, 0] - M[:, 0, 2], M[:, 0, 1] - M[:, 1, 0]], dim=1)
+    gradient = torch.cat([-cU.sum(0), (vee - torch.linalg.cross(moved, cU)).sum(0)])
+    missing = cA.clone()
+    if weights is not None:
+        missing -= cU[:, :, None] * cU[:, None, :] / weights.clamp_min(1e-300)[:, None, None]
+    J = torch.zeros(len(moved), 3, 6, dtype=moved.dtype, device=moved.device)
+    J[:, range(3), range(3)] = 1
+    for row, column, sign, axis in ((0, 4, 1, 2), (0, 5, -1, 1), (1, 3, -1, 2), (1, 5, 1, 0), (2, 3, 1, 1), (2, 4, -1, 0)):
+        J[:, row, column] = sign * moved[:, axis]
+    flat = J.reshape(-1, 6)
+    information = flat.T @ (cQ @ J).reshape(-1, 6)
+    observed = information - flat.T @ (missing @ J).reshape(-1, 6)
+    return gradient.cpu().numpy(), information.cpu().numpy(), observed.cpu().numpy()
+
+
+def pack(S: Tensor) -> Tensor:
+    """Symmetric (..., 3, 3) -> (..., 6)."""
+    return torch.stack([S[..., i, j] for i, j in SYMMETRIC], dim=-1)
+
+
+def unpack(six: Tensor) -> Tensor:
+    """(..., 6) -> symmetric (..., 3, 3)."""
+    return six[..., _FULL.to(six.device)].reshape(*six.shape[:-1], 3, 3)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which components may be partners: thinning, two-way visibility, nearest neighbours, colour and label weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from garps_core.config import Alignment, Config, Rung
+from garps_core.geometry import Array, se3_inverse
+from garps_core.objective import Pairs, pack
+from garps_core.types import Frustum, Mixture
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A mixture on the device: means (n, 3), covariances (n, 6), weights (n,), colours (n, 3), labels (n,) or None."""
+
+    means: Tensor
+    covariances: Tensor
+    weights: Tensor
+    colours: Tensor
+    labels: Tensor | None
+    frustum: Frustum | None
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def take(self, index: Tensor) -> Cloud:
+        """Components `index` (bool mask or integers)."""
+        labels = None if self.labels is None else self.labels[index]
+        return Cloud(
+            self.means[index], self.covariances[index], self.weights[index], self.colours[index], labels, self.frustum
+        )
+
+
+def to_cloud(mixture: Mixture, config: Config) -> Cloud:
+    """Move a mixture to the device and arithmetic of the config."""
+    dtype = torch.float64 if config.dtype == "float64" else torch.float32
+    means, covariances, weights, colours = (
+        torch.as_tensor(np.ascontiguousarray(part), dtype=dtype, device=config.device)
+        for part in (mixture.means, mixture.covariances, mixture.weights, mixture.colours)
+    )
+    labels = None if mixture.labels is None else torch.as_tensor(mixture.labels, device=config.device)
+    return Cloud(means, pack(covariances), weights, colours, labels, mixture.frustum)
+
+
+def thin(cloud: Cloud, components: int) -> Cloud:
+    """An even subsample of at most `components` by index; lifted mixtures are listed along a space-filling curve."""
+    if len(cloud) <= components:
+        return cloud
+    index = torch.arange(components, device=cloud.means.device, dtype=torch.float64) * (len(cloud) / components)
+    return cloud.take(index.long())
+
+
+def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: float) -> Tensor:
+    """Mask (n,) of components that the other camera sees when moved by T: in its image, not behind its depth."""
+    if other is None:
+        return torch.ones(len(cloud), dtype=torch.bool, device=cloud.means.device)
+    like = cloud.means
+    R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
+    K = torch.as_tensor(other.K, dtype=like.dtype, device=like.device)
+    depth = torch.as_tensor(other.depth, dtype=like.dtype, device=like.device)
+    height, width = depth.shape
+    p = like @ R.T + t
+    z = p[:, 2].clamp_min(1e-6)
+    u = (p[:, 0] / z * K[0, 0] + K[0, 2]).round().clamp(-1, width).long()
+    v = (p[:, 1] / z * K[1, 1] + K[1, 2]).round().clamp(-1, height).long()
+    inside = (p[:, 2] > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen = depth[v.clamp(0, height - 1), u.clamp(0, width - 1)]
+    hidden = p[:, 2] > seen * (1 + occlusion_ratio)  # False where the depth is NaN: unknown is not hidden
+    return inside & ~hidden
+
+
+def overlap(source: Cloud, target: Cloud, T: Array, settings: Alignment) -> float:
+    """Smaller of the two shares of components that the other camera sees under T, 0..1."""
+    ahead = visible(source, T, target.frustum, settings.occlusion_ratio)
+    back = visible(target, se3_inverse(T), source.frustum, settings.occlusion_ratio)
+    return min(float(ahead.double().mean()), float(back.double().mean()))
+
+
+def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignment) -> Pairs:
+    """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances scaled by the rung."""
+    index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)))
+    chosen = index.T.contiguous()  # (k, n)
+    log_weights = torch.log(partners.weights.clamp_min(1e-30))[chosen]
+    log_weights = log_weights - _colour_cost(rows, partners, chosen, settings.colour_variance)
+    if rows.labels is not None and partners.labels is not None:
+        differs = rows.labels[None] != partners.labels[chosen]
+        log_weights = log_weights + differs * float(np.log(max(settings.semantic_discount, 1e-30)))
+    log_weights = log_weights.masked_fill(distance.T > settings.max_distance_m, -torch.inf)
+    scale = rung.covariance_scale
+    covariances = rows.covariances * scale
+    return Pairs(
+        rows.means,
+        covariances,
+        rows.weights / rows.weights.sum(),
+        _log_floor(covariances, partners, settings.outlier_floor),
+        partners.means.T[:, chosen].contiguous(),
+        (partners.covariances.T * scale)[:, chosen].contiguous(),
+        log_weights,
+    )
+
+
+def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int) -> tuple[Tensor, Tensor]:
+    """Indices and distances (n, k) of the nearest partners by Euclidean distance of the means."""
+    like = rows.means
+    R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
+    moved = like @ R.T + t
+    if like.is_cuda:
+        found = [torch.cdist(block, partners.means).topk(k, largest=False) for block in moved.split(4096)]
+        return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
+    distance, index = cKDTree(partners.means.numpy(), balanced_tree=False, compact_nodes=False).query(
+        moved.numpy(), k=k, workers=-1
+    )
+    shape = (len(rows), k)
+    return torch.from_numpy(index.reshape(shape)), torch.from_numpy(distance.reshape(shape)).to(like.dtype)
+
+
+def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:
+    """Half the squared Mahalanobis distance of the colours, both with `variance` per channel."""
+    cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
+    for channel in range(3):
+        cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
+    return cost / (4 * variance)
+
+
+def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:
+    """log o_i: `floor` times what one partner of mean weight gives a row of the same covariance at distance zero."""
+    a, b, c, e, f, i = (2 * covariances).double().unbind(-1)
+    det = a * (e * i - f * f) - b * (b * i - c * f) + c * (b * f - c * e)
+    scale = np.log(max(floor, 1e-30)) + torch.log(partners.weights.double().mean())
+    return (scale - 0.5 * torch.log(det.clamp_min(1e-60))).to(covariances.dtype)
+
+
+def without_floor(pairs: Pairs) -> Pairs:
+    """The same pairs with unit outlier density, as the paper's plain sum needs."""
+    return replace(pairs, log_floor=torch.zeros_like(pairs.log_floor))
