@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings for the whole suite; they must stand before anything imports a message class."""
+
+import os
+
+from hypothesis import settings
+
+# Without this, Jazzy accepts a scalar of the wrong type and publishes garbage for it.
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+
+# No deadline: a shared machine may stall for longer than any example takes.
+settings.register_profile("garps", deadline=None)
+settings.load_profile("garps")
