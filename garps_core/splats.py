@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from garps_core.errors import InputError
+from garps_core.geometry import transform
 from garps_core.types import Float64Array, FloatArray, Mixture
 
 SH_CONSTANT = 0.28209479177387814
@@ -55,6 +56,28 @@ def write_splats(mixture: Mixture, path: str | Path, opacities: FloatArray | Non
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror}): expected a writable file name") from None
     return path
+
+
+def write_aligned(source: Mixture, target: Mixture, T_target_source: Float64Array, folder: str | Path) -> list[Path]:
+    """Write source.ply and target.ply in their own cameras' frames, and aligned.ply: both in the target's.
+
+    Raises:
+        InputError: a folder that cannot be made, or what `write_splats` refuses.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder} ({error.strerror}): expected a writable place") from None
+    R = T_target_source[:3, :3]
+    both = Mixture(
+        np.concatenate([transform(T_target_source, source.means.astype(np.float64)), target.means]),
+        np.concatenate([R @ source.covariances @ R.T, target.covariances]),
+        np.concatenate([source.weights, target.weights]),
+        np.concatenate([source.colours, target.colours]),
+    )
+    parts = {"source": source, "target": target, "aligned": both}
+    return [write_splats(mixture, folder / f"{name}.ply") for name, mixture in parts.items()]
 
 
 def splat_table(mixture: Mixture, opacities: FloatArray | None = None) -> npt.NDArray[np.float32]:

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `garps` command: parse, call the core, print. Exit code 0 = a pose to use, 1 = none, 2 = wrong input."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from scipy.spatial.transform import Rotation
+
+from garps_core import __version__
+from garps_core.align import estimate_relative_pose
+from garps_core.config import Config
+from garps_core.errors import ConfigError, GarpsError, InputError
+from garps_core.files import read_view
+from garps_core.reconstruct import reconstruct
+from garps_core.report import as_json, as_text
+from garps_core.types import Float64Array, PoseEstimate, Prior, View, checked_intrinsics
+
+# typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
+ClickException: type[Exception] = typer.BadParameter.__mro__[2]
+
+Four = tuple[float, float, float, float]
+app = typer.Typer(
+    help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code. A user's mistake is one line on stderr and code 2."""
+    try:
+        code = app(args=arguments, prog_name="garps", standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except GarpsError as error:
+        message = str(error)
+    except ClickException as error:
+        message = error.format_message()  # type: ignore[attr-defined]
+        if not message:  # no arguments: the help has been printed
+            return 2
+    except typer.Abort:
+        return 130
+    print(f"garps: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"garps {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None: ...
+
+
+@app.command()
+def align(
+    source: Annotated[Path, typer.Argument(help="Image of the source camera.", metavar="SRC")],
+    target: Annotated[Path, typer.Argument(help="Image of the target camera.", metavar="TGT")],
+    K: Annotated[Four, typer.Option("--K", help="Pinhole intrinsics in pixels.", metavar="FX FY CX CY")],
+    K_target: Annotated[
+        Four | None, typer.Option("--K-target", help="Of the target, if different.", metavar="FX FY CX CY")
+    ] = None,
+    depth_source: Annotated[
+        Path | None, typer.Option(help="Depth registered to SRC: 16-bit PNG (mm), .npy or float TIFF (m).")
+    ] = None,
+    depth_target: Annotated[Path | None, typer.Option(help="Depth registered to TGT.")] = None,
+    depth_scale: Annotated[
+        float | None, typer.Option(help="Metres per unit of the depth files. [integers 0.001, floats 1]")
+    ] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Start pose T_target_source.", metavar='"X Y Z QX QY QZ QW"')
+    ] = None,
+    prior_sigma: Annotated[
+        str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
+    ] = None,
+    preset: Annotated[str, typer.Option(help="default, sensor, monocular or paper.")] = "default",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+    ] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print everything as JSON, full precision.")] = False,
+    figure: Annotated[Path | None, typer.Option(help="Write a before/after picture (needs matplotlib).")] = None,
+    ply: Annotated[Path | None, typer.Option(help="Write the mixtures as splat PLY files to this folder.")] = None,
+) -> int:
+    """Pose of the source camera in the target camera's frame, metric, with covariance.
+
+    Points of the source go to the target as x_target = R x_source + t, in metres; optical frames: x right, y down,
+    z forward. Prints translation, rotation, their sigmas and how far to trust them.
+
+    \b
+    Example:
+      garps align a.png b.png --K 525 525 319.5 239.5 \\
+          --depth-source a_depth.png --depth-target b_depth.png --figure pair.png
+    \b
+    Exit code: 0 = converged, 1 = no pose to be trusted (the reason is printed), 2 = wrong input.
+    """
+    config = _configured(preset, set_ or [], device)
+    start = _prior(prior, prior_sigma)
+    views = (
+        read_view(source, _intrinsics("--K", K), depth_source, depth_scale),
+        read_view(target, _intrinsics("--K-target", K_target or K), depth_target, depth_scale),
+    )
+    estimate = estimate_relative_pose(*views, config, start)
+    print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
+    _write_extras(estimate, views, config, figure, ply)
+    return 0 if estimate.ok else 1
+
+
+@app.command()
+def doctor() -> int:
+    """Versions, devices, memory and a self-test of this installation, for a bug report.
+
+    \b
+    Exit code: 0 = all that is needed is here and works, 1 = not.
+    """
+    from garps_core.doctor import examine
+
+    rows, healthy = examine()
+    for name, finding in rows:
+        print(f"{name:<11} {finding}")
+    return 0 if healthy else 1
+
+
+def _configured(preset: str, changes: list[str], device: str | None) -> Config:
+    config = Config.preset(preset)
+    for change in changes:
+        name, equals, text = change.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {change!r} has no '=': expected NAME=VALUE, e.g. --set lifting.stride=4")
+        config = config.replace({name: _value(name, text, config.settings().get(name))})
+    config = config if device is None else config.replace({"device": device})
+    try:
+        torch.empty(0, device=config.device)
+    except (RuntimeError, AssertionError):
+        raise ConfigError(f"device {config.device!r} is not here: expected one of those `garps doctor` lists") from None
+    return config
+
+
+def _value(name: str, text: str, current: Any) -> Any:
+    """Text to the type the setting has now; Config itself checks names and ranges."""
+    if isinstance(current, bool):
+        if text.lower() not in ("true", "false"):
+            raise ConfigError(f"{name} is {text!r}: expected true or false")
+        return text.lower() == "true"
+    if isinstance(current, tuple):
+        raise ConfigError(f"{name} cannot be set from the command line: expected a number or a word setting")
+    if isinstance(current, (int, float)):
+        try:
+            return type(current)(text)
+        except ValueError:
+            kind = "an integer" if isinstance(current, int) else "a number"
+            raise ConfigError(f"{name} is {text!r}: expected {kind}") from None
+    return text
+
+
+def _intrinsics(option: str, values: Four) -> Float64Array:
+    fx, fy, cx, cy = values
+    try:
+        return checked_intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    except InputError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def _numbers(option: str, text: str, count: int, meaning: str) -> Float64Array:
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        raise InputError(f"{option} is {text!r}: expected {count} numbers, {meaning}") from None
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{option} is {text!r}: expected {count} finite numbers, {meaning}")
+    return values
+
+
+def _prior(pose: str | None, sigma: str | None) -> Prior | None:
+    if pose is None:
+        if sigma is not None:
+            raise InputError("--prior-sigma is given without --prior: expected both or none")
+        return None
+    values = _numbers("--prior", pose, 7, '"x y z qx qy qz qw" in metres and a unit quaternion')
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1) > 0.01:
+        raise InputError(f"--prior has a quaternion of length {norm:g}: expected 1, order qx qy qz qw")
+    sigmas = _numbers("--prior-sigma", sigma or "0.1 0.05", 2, '"metres radians"')
+    if (sigmas <= 0).any():
+        raise InputError(f"--prior-sigma is {sigma!r}: expected two positive numbers, metres and radians")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+    return Prior(T, np.diag(np.repeat(sigmas**2, 3)))
+
+
+def _write_extras(
+    estimate: PoseEstimate, views: tuple[View, View], config: Config, figure: Path | None, ply: Path | None
+) -> None:
+    if figure is None and ply is None:
+        return
+    if estimate.T_target_source is None:
+        print("garps: note: no pose, so no picture and no PLY files are written", file=sys.stderr)
+        return
+    mixtures = reconstruct(views[0], config), reconstruct(views[1], config)
+    if ply is not None:
+        from garps_core.splats import write_aligned
+
+        write_aligned(*mixtures, estimate.T_target_source, ply)
+    if figure is not None:
+        from garps_core.figure import before_after
+
+        start = np.eye(4) if estimate.initial is None else estimate.initial.T_target_source
+        before_after(*mixtures, start, estimate.T_target_source, figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
