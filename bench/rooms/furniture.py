@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench.rooms import prints
-from bench.rooms.mesh import Part, box, cylinder, lathe, moved, superellipsoid
+from bench.rooms.mesh import Part, board, box, cylinder, lathe, moved, superellipsoid
 from bench.rooms.paint import Paint
 from bench.rooms.small_things import book_row, clutter
 from bench.rooms.textures import Texture
@@ -33,12 +33,12 @@ def bookshelf(paint: Paint, rng: np.random.Generator) -> list[Part]:
     w, d, h = rng.uniform(0.8, 1.4), rng.uniform(0.26, 0.34), rng.uniform(1.3, 2.1)
     wood, t = paint.wood(), 0.022
     parts = [
-        box((x, -d, 0), (x + t, 0, h), wood, "shelf", _uv(rng)) for x in (-w / 2, w / 2 - t)
+        board((x, -d, 0), (x + t, 0, h), wood, "shelf", _uv(rng)) for x in (-w / 2, w / 2 - t)
     ]
-    parts.append(box((-w / 2, -0.008, 0), (w / 2, 0, h), wood, "shelf", _uv(rng)))
+    parts.append(board((-w / 2, -0.008, 0), (w / 2, 0, h), wood, "shelf", _uv(rng)))
     levels = np.linspace(0.06, h - t, int(round(h / 0.36)) + 1)
     for k, z in enumerate(levels):
-        parts.append(box((-w / 2 + t, -d, z), (w / 2 - t, -0.008, z + t), wood, "shelf", _uv(rng)))
+        parts.append(board((-w / 2 + t, -d, z), (w / 2 - t, -0.008, z + t), wood, "shelf", _uv(rng)))
         if k + 1 < len(levels):
             parts += _shelf_contents(paint, rng, w - 2 * t, d, z + t, levels[k + 1] - z - t)
     return parts + moved(clutter(paint, rng, 0.8 * w, d, 2), shift=(0, 0, h))
@@ -64,7 +64,7 @@ def cabinet(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Low cabinet with drawers and things on top."""
     w, d, h = rng.uniform(0.9, 1.6), rng.uniform(0.38, 0.46), rng.uniform(0.6, 0.9)
     wood, metal = paint.wood(), paint.metal()
-    parts = [box((-w / 2, -d, 0.08), (w / 2, 0, h), wood, "cabinet", _uv(rng))]
+    parts = [board((-w / 2, -d, 0.08), (w / 2, 0, h), wood, "cabinet", _uv(rng))]
     parts += _legs(rng, w - 0.06, d - 0.02, 0.08, 0.05, wood, "cabinet")
     cols, rows = int(rng.integers(2, 4)), int(rng.integers(1, 4))
     gap = 0.012
@@ -72,7 +72,7 @@ def cabinet(paint: Paint, rng: np.random.Generator) -> list[Part]:
         for j in range(rows):
             cw, ch = w / cols, (h - 0.1) / rows
             x, z = -w / 2 + i * cw, 0.09 + j * ch
-            parts.append(box((x + gap, -d - 0.018, z + gap), (x + cw - gap, -d, z + ch - gap), wood, "cabinet", _uv(rng)))
+            parts.append(board((x + gap, -d - 0.018, z + gap), (x + cw - gap, -d, z + ch - gap), wood, "cabinet", _uv(rng)))
             knob = superellipsoid((0.016, 0.014, 0.016), metal, "cabinet", n=12)
             parts += moved([knob], shift=(x + cw / 2, -d - 0.03, z + ch * 0.6))
     return parts + moved(clutter(paint, rng, 0.9 * w, d, int(rng.integers(3, 6))), shift=(0, 0, h))
@@ -111,13 +111,13 @@ def chair(paint: Paint, rng: np.random.Generator) -> list[Part]:
     w, d, h = 0.42, 0.44, 0.45
     wood = paint.wood()
     parts = _legs(rng, w, d, h, 0.035, wood, "chair")
-    parts.append(box((-w / 2, -d, h), (w / 2, 0, h + 0.025), wood, "chair", _uv(rng)))
+    parts.append(board((-w / 2, -d, h), (w / 2, 0, h + 0.025), wood, "chair", _uv(rng)))
     cushion = superellipsoid((w / 2 - 0.01, d / 2 - 0.02, 0.025), paint.fabric(), "chair", 0.3)
     parts += moved([cushion], shift=(0, -d / 2, h + 0.045))
     for x in (-w / 2, w / 2 - 0.035):
-        parts.append(box((x, -0.035, h), (x + 0.035, 0, 0.92), wood, "chair", _uv(rng)))
+        parts.append(board((x, -0.035, h), (x + 0.035, 0, 0.92), wood, "chair", _uv(rng)))
     for z in (0.60, 0.71, 0.82):
-        parts.append(box((-w / 2, -0.028, z), (w / 2, -0.008, z + 0.06), wood, "chair", _uv(rng)))
+        parts.append(board((-w / 2, -0.028, z), (w / 2, -0.008, z + 0.06), wood, "chair", _uv(rng)))
     return parts
 
 
@@ -125,8 +125,8 @@ def table(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Dining table with things on it."""
     w, d, h = rng.uniform(1.1, 1.6), rng.uniform(0.7, 0.9), rng.uniform(0.72, 0.77)
     wood = paint.wood()
-    parts = [box((-w / 2, -d, h - 0.035), (w / 2, 0, h), wood, "table", _uv(rng))]
-    parts.append(box((-w / 2 + 0.06, -d + 0.06, h - 0.12), (w / 2 - 0.06, -0.06, h - 0.035), wood, "table", _uv(rng)))
+    parts = [board((-w / 2, -d, h - 0.035), (w / 2, 0, h), wood, "table", _uv(rng))]
+    parts.append(board((-w / 2 + 0.06, -d + 0.06, h - 0.12), (w / 2 - 0.06, -0.06, h - 0.035), wood, "table", _uv(rng)))
     parts += moved(_legs(rng, w - 0.08, d - 0.08, h - 0.035, 0.06, wood, "table"), shift=(0, -0.04, 0))
     things = clutter(paint, rng, 0.85 * w, 0.8 * d, int(rng.integers(4, 7)))
     return parts + moved(things, shift=(0, -0.1 * d, h))
@@ -143,8 +143,8 @@ def coffee_table(paint: Paint, rng: np.random.Generator) -> list[Part]:
         parts += moved(cylinder(0.6 * r, 0, 0.02, wood, "table", 32), shift=(0, -r, 0))
         return parts + moved(clutter(paint, rng, 1.2 * r, 1.2 * r, 3), shift=(0, -0.4 * r, h))
     w, d = rng.uniform(0.8, 1.1), rng.uniform(0.5, 0.65)
-    parts = [box((-w / 2, -d, h - 0.03), (w / 2, 0, h), wood, "table", _uv(rng))]
-    parts.append(box((-w / 2 + 0.05, -d + 0.05, 0.12), (w / 2 - 0.05, -0.05, 0.14), wood, "table", _uv(rng)))
+    parts = [board((-w / 2, -d, h - 0.03), (w / 2, 0, h), wood, "table", _uv(rng))]
+    parts.append(board((-w / 2 + 0.05, -d + 0.05, 0.12), (w / 2 - 0.05, -0.05, 0.14), wood, "table", _uv(rng)))
     parts += _legs(rng, w, d, h - 0.03, 0.05, wood, "table")
     return parts + moved(clutter(paint, rng, 0.85 * w, 0.85 * d, 3), shift=(0, -0.07 * d, h))
 
@@ -153,9 +153,9 @@ def desk(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Desk with a screen, drawers and things."""
     w, d, h = rng.uniform(1.1, 1.5), rng.uniform(0.58, 0.7), 0.74
     wood, dark = paint.wood(), paint.plain((0.10, 0.10, 0.11))
-    parts = [box((-w / 2, -d, h - 0.03), (w / 2, 0, h), wood, "table", _uv(rng))]
+    parts = [board((-w / 2, -d, h - 0.03), (w / 2, 0, h), wood, "table", _uv(rng))]
     parts += _legs(rng, w, d, h - 0.03, 0.045, wood, "table")
-    parts.append(box((w / 2 - 0.42, -d + 0.04, 0.3), (w / 2 - 0.05, -0.04, h - 0.03), wood, "table", _uv(rng)))
+    parts.append(board((w / 2 - 0.42, -d + 0.04, 0.3), (w / 2 - 0.05, -0.04, h - 0.03), wood, "table", _uv(rng)))
     sw, sh = 0.56, 0.33
     screen = paint.printed((sw - 0.02, sh - 0.02), prints.keys_and_screen, glow=0.25)
     monitor = [

@@ -215,7 +215,7 @@ def _lay_rug(plan: _Plan, paint: Paint, rng: np.random.Generator) -> None:
 
 def _hang_pictures(plan: _Plan, paint: Paint, rng: np.random.Generator) -> None:
     """Pictures, and a clock, on the free places of the walls."""
-    for n in range(int(rng.integers(7, 11))):
+    for n in range(int(rng.integers(12, 17))):
         w, h = (0.3, 0.3) if n == 0 else (float(v) for v in rng.uniform(0.25, 0.75, 2))
         k = int(rng.integers(4))
         x, z = float(rng.uniform(0.1 + w / 2, plan.wall(k)[2] - 0.1 - w / 2)), float(rng.uniform(1.45, 1.75))

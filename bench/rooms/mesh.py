@@ -108,6 +108,18 @@ def box(
     return Part(np.array(corners), np.array(uv), np.array(normals), patch, texture, label)
 
 
+def board(
+    low: Sequence[float], high: Sequence[float], texture: Texture, label: str, uv0: Sequence[float] = (0.0, 0.0)
+) -> Part:
+    """Like `box`, with u along the longer side of each face, as grain runs in wood."""
+    part = box(low, high, texture, label, uv0)
+    quads = part.uv.reshape(-1, 6, 2)
+    extent = np.ptp(quads, axis=1)
+    upright = extent[:, 1] > extent[:, 0]
+    quads[upright] = quads[upright][..., ::-1]
+    return part
+
+
 def _sheet(points: Array, uv: Array, normals: Array, texture: Texture, label: str) -> Part:
     """Triangulate an RxC grid of points with uv and normals."""
     rows, cols = points.shape[:2]
@@ -170,7 +182,15 @@ def superellipsoid(radii: Sequence[float], texture: Texture, label: str, power: 
     normals = direction(max(2 - power, 1.0)) / np.asarray(radii, float)
     mean = float(np.mean(radii))
     uv = np.stack(np.broadcast_arrays(phi * mean * np.ones_like(theta), -theta * mean), axis=-1)
-    return _sheet(points, uv, normals, texture, label)
+    part = _sheet(points, uv, normals, texture, label)
+    return part if power > 0.7 else replace(part, uv=_boxed(part.corners))
+
+
+def _boxed(corners: Array) -> Array:
+    """Mx3x2 m: uv of Mx3x3 triangles projected along their main direction, as cloth is sewn onto a cushion."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.abs(normal).argmax(axis=1)]
+    return np.take_along_axis(corners, np.repeat(axes[:, None], 3, axis=1), axis=2)
 
 
 def leaf(base: Array, tip: Array, width: float, texture: Texture, label: str, droop: float = 0.3) -> Part:

@@ -21,7 +21,7 @@ Float32Array = npt.NDArray[np.float32]
 TILE = 4  # shadow rays use 16 light points and directions, a different one at each place of a 4x4 tile
 AMBIENT = np.array([0.40, 0.41, 0.43], np.float32)
 OCCLUSION_M = 0.45
-MID_GREY = 0.27
+MID_GREY = 0.33
 TO_LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
 
 

@@ -102,18 +102,19 @@ def noise(
         if rows > height or cols > width:
             rows, cols = min(rows, height), min(cols, width)
         lattice = rng.uniform(-1, 1, (rows, cols)).astype(np.float32)
-        total += gain**octave * _stretch(lattice, shape)
+        smooth = max(height / rows, width / cols) > 5
+        total += gain**octave * _stretch(lattice, shape, cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR)
         weight += gain ** (2 * octave)
     return (total / np.float32(np.sqrt(weight))).astype(np.float32)
 
 
-def _stretch(lattice: Image, shape: tuple[int, int]) -> Image:
-    """Resize a repeating lattice with a cubic kernel."""
+def _stretch(lattice: Image, shape: tuple[int, int], kernel: int) -> Image:
+    """Resize a repeating lattice."""
     height, width = shape
     padded = np.pad(lattice, 2, mode="wrap")
     rows, cols = lattice.shape
     M = np.array([[cols / width, 0, 1.5 + 0.5 * cols / width], [0, rows / height, 1.5 + 0.5 * rows / height]])
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    flags = kernel | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(padded, M, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
@@ -141,7 +142,7 @@ def plaster(rng: np.random.Generator, shape: tuple[int, int], texel_m: float, co
     """Painted wall: cloudy, with roller grain, scuffs and small dents."""
     cloud = noise(rng, shape, (0.9 / texel_m, 0.9 / texel_m), 3)
     grain = noise(rng, shape, (0.06 / texel_m, 0.06 / texel_m), 4, 0.8)
-    image = tint(colour, 0.05 * cloud + 0.07 * grain, 0.02 * cloud)
+    image = tint(colour, 0.025 * cloud + 0.06 * grain, 0.01 * cloud)
     _speckle(rng, image, texel_m, density=14, size_m=(0.006, 0.03), depth=0.22)
     return image
 
@@ -215,8 +216,8 @@ def wood(rng: np.random.Generator, shape: tuple[int, int], texel_m: float, colou
     bend = noise(rng, shape, (0.15 / texel_m, 0.7 / texel_m), 3)
     pores = noise(rng, shape, (0.006 / texel_m, 0.12 / texel_m), 3, 0.7)
     v = np.arange(height, dtype=np.float32)[:, None]
-    periods = max(round(height * texel_m / 0.035), 1)
-    phase = 2 * np.pi * periods * v / height + 3.2 * bend
+    periods = max(round(height * texel_m / 0.028), 1)
+    phase = 2 * np.pi * periods * v / height + 5 * bend
     u = np.arange(width, dtype=np.float32)[None, :]
     for _ in range(max(int(1.5 * height * width * texel_m**2), 1)):
         cx, cy = rng.uniform(0, width), rng.uniform(0, height)
@@ -224,7 +225,7 @@ def wood(rng: np.random.Generator, shape: tuple[int, int], texel_m: float, colou
         phase = phase + 7 * np.exp(-r2)
         pores = pores - 1.2 * np.exp(-2.5 * r2)
     rings = np.sin(phase + 0.6 * np.sin(2 * phase))
-    return tint(colour, (0.10 * rings + 0.13 * pores + 0.06 * bend).astype(np.float32), 0.02 * bend)
+    return tint(colour, ((0.045 + 0.03 * bend) * rings + 0.11 * pores + 0.06 * bend).astype(np.float32), 0.02 * bend)
 
 
 def planks(rng: np.random.Generator, shape: tuple[int, int], texel_m: float, colour: Colour) -> Image:
