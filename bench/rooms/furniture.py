@@ -32,11 +32,9 @@ def bookshelf(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Open shelf with books and a few things."""
     w, d, h = rng.uniform(0.8, 1.4), rng.uniform(0.26, 0.34), rng.uniform(1.3, 2.1)
     wood, t = paint.wood(), 0.022
-    parts = [
-        board((x, -d, 0), (x + t, 0, h), wood, "shelf", _uv(rng)) for x in (-w / 2, w / 2 - t)
-    ]
+    parts = [board((x, -d, 0), (x + t, 0, h), wood, "shelf", _uv(rng)) for x in (-w / 2, w / 2 - t)]
     parts.append(board((-w / 2, -0.008, 0), (w / 2, 0, h), wood, "shelf", _uv(rng)))
-    levels = np.linspace(0.06, h - t, int(round(h / 0.36)) + 1)
+    levels = np.linspace(0.06, h - t, round(h / 0.36) + 1)
     for k, z in enumerate(levels):
         parts.append(board((-w / 2 + t, -d, z), (w / 2 - t, -0.008, z + t), wood, "shelf", _uv(rng)))
         if k + 1 < len(levels):
@@ -50,8 +48,14 @@ def _shelf_contents(
     """Books over most of one shelf, things on the rest."""
     share = float(rng.uniform(0.5, 1.0)) if rng.random() < 0.8 else 0.0
     left = -width / 2 + (0 if rng.random() < 0.5 else (1 - share) * width)
-    parts = moved(book_row(paint, rng, share * width, min(depth - 0.05, 0.2), min(room - 0.03, 0.29)),
-                  shift=(left, -0.03, low)) if share else []
+    parts = (
+        moved(
+            book_row(paint, rng, share * width, min(depth - 0.05, 0.2), min(room - 0.03, 0.29)),
+            shift=(left, -0.03, low),
+        )
+        if share
+        else []
+    )
     rest = (1 - share) * width
     if rest > 0.2 and room > 0.2:
         centre = (left + share * width + width / 2) / 2 if left < -width / 2 + 1e-6 else (left - width / 2) / 2
@@ -72,7 +76,8 @@ def cabinet(paint: Paint, rng: np.random.Generator) -> list[Part]:
         for j in range(rows):
             cw, ch = w / cols, (h - 0.1) / rows
             x, z = -w / 2 + i * cw, 0.09 + j * ch
-            parts.append(board((x + gap, -d - 0.018, z + gap), (x + cw - gap, -d, z + ch - gap), wood, "cabinet", _uv(rng)))
+            low, high = (x + gap, -d - 0.018, z + gap), (x + cw - gap, -d, z + ch - gap)
+            parts.append(board(low, high, wood, "cabinet", _uv(rng)))
             knob = superellipsoid((0.016, 0.014, 0.016), metal, "cabinet", n=12)
             parts += moved([knob], shift=(x + cw / 2, -d - 0.03, z + ch * 0.6))
     return parts + moved(clutter(paint, rng, 0.9 * w, d, int(rng.integers(3, 6))), shift=(0, 0, h))

@@ -9,16 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bench.rooms import furniture as fu
-from bench.rooms import prints
-from bench.rooms.mesh import Array, Part, bounds, box, cylinder, lathe, moved, superellipsoid
+from bench.rooms import lights, prints
+from bench.rooms.mesh import Array, Part, bounds, box, moved, superellipsoid
 from bench.rooms.paint import Paint
-from bench.rooms.render import Light, Room
+from bench.rooms.render import Room
 from bench.rooms.small_things import ball, plant
 
 Rect = tuple[float, float, float, float]  # low x, low y, high x, high y
 Maker = Callable[[Paint, np.random.Generator], list[Part]]
 
-LIGHT_POINTS = 16
 SKIN = 0.1  # thickness of walls, m
 
 
@@ -106,8 +105,10 @@ def make_room(seed: int, texture: float = 1.0) -> Room:
     panes = _openings(plan, paint, rng)
     _furnish(plan, paint, rng)
     _hang_pictures(plan, paint, rng)
-    lights = _lights(plan, paint, rng, panes)
-    return Room(plan.parts, size, lights, seed)
+    lamp, light = lights.ceiling_lamp(paint, rng, size)
+    plan.parts += lamp
+    shining = [light, *(lights.window_light(rng, plan.wall(k)[:2], pane) for k, pane in panes)]
+    return Room(plan.parts, size, shining, seed)
 
 
 def _shell(plan: _Plan, paint: Paint) -> None:
@@ -146,8 +147,9 @@ def _door(plan: _Plan, paint: Paint, rng: np.random.Generator, k: int) -> None:
     x = float(rng.uniform(0.7, plan.wall(k)[2] - 0.7))
     leaf, trim, metal = paint.printed((w, h), prints.door_leaf, 0.0025), paint.plain((0.9, 0.89, 0.86)), paint.metal()
     parts = [box((-w / 2, -0.02, 0), (w / 2, 0, h), leaf, "door")]
-    for a, b in (((-w / 2 - 0.07, 0), (-w / 2, h)), ((w / 2, 0), (w / 2 + 0.07, h)), ((-w / 2 - 0.07, h), (w / 2 + 0.07, h + 0.07))):
-        parts.append(box((a[0], -0.035, a[1]), (b[0], 0, b[1]), trim, "trim"))
+    out = w / 2 + 0.07
+    for x0, z0, x1, z1 in ((-out, 0, -w / 2, h), (w / 2, 0, out, h), (-out, h, out, h + 0.07)):
+        parts.append(box((x0, -0.035, z0), (x1, 0, z1), trim, "trim"))
     parts += moved([superellipsoid((0.06, 0.018, 0.012), metal, "door", 0.6, 16)], shift=(w / 2 - 0.1, -0.06, 1.02))
     parts += moved([superellipsoid((0.018, 0.03, 0.018), metal, "door", 1.0, 12)], shift=(w / 2 - 0.06, -0.035, 1.02))
     placed = plan.on_wall(k, x, parts)
@@ -210,7 +212,8 @@ def _lay_rug(plan: _Plan, paint: Paint, rng: np.random.Generator) -> None:
     high = np.minimum((x1 + grow, y1 + grow), plan.size[:2] - 0.1)
     size = (float(high[0] - low[0]), float(high[1] - low[1]))
     texture = paint.printed(size, prints.rug, 0.0025)
-    plan.parts.append(box((*low, 0), (*high, 0.008), texture, "rug"))
+    # No sides: at a few millimetres they would only flicker along the edge.
+    plan.parts.append(box((*low, 0), (*high, 0.004), texture, "rug", faces=("top",)))
 
 
 def _hang_pictures(plan: _Plan, paint: Paint, rng: np.random.Generator) -> None:
@@ -229,28 +232,3 @@ def _hang_pictures(plan: _Plan, paint: Paint, rng: np.random.Generator) -> None:
         parts = [box(low, high, front, "picture", faces=("front",))]
         parts.append(box(low, high, edge, "picture", faces=("left", "right", "top", "bottom")))
         plan.parts += plan.on_wall(k, x, parts)
-
-
-def _lights(
-    plan: _Plan, paint: Paint, rng: np.random.Generator, panes: list[tuple[int, Rect]]
-) -> list[Light]:
-    """A lamp under the ceiling and the windows, each as a few points of an area."""
-    w, d, h = (float(v) for v in plan.size)
-    at = np.array([w * rng.uniform(0.35, 0.65), d * rng.uniform(0.35, 0.65), h - 0.3])
-    shade = paint.finish(prints.flat((0.95, 0.92, 0.85)), 0.02, glow=1.0)
-    lamp = [lathe([(0.17, 0.0), (0.19, 0.06), (0.12, 0.14), (0.02, 0.16)], shade, "lamp")]
-    lamp += moved(cylinder(0.012, 0.16, 0.28, paint.metal(), "lamp", 10))
-    plan.parts += moved(lamp, shift=(at[0], at[1], h - 0.28))
-    turn = 2.39996 * np.arange(LIGHT_POINTS)
-    spread = 0.22 * np.sqrt((np.arange(LIGHT_POINTS) + 0.5) / LIGHT_POINTS)
-    points = at + np.stack([spread * np.cos(turn), spread * np.sin(turn), np.zeros(LIGHT_POINTS)], axis=1)
-    lights = [Light(points, np.array([1.0, 0.93, 0.82]) * float(rng.uniform(1.6, 2.6)), None)]
-    grid = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
-    for k, (x0, z0, x1, z1) in panes:
-        yaw, corner, _ = plan.wall(k)
-        c, s = np.cos(yaw), np.sin(yaw)
-        local = np.stack([x0 + grid[:, 0] * (x1 - x0), np.full(16, -0.15), z0 + grid[:, 1] * (z1 - z0)], axis=1)
-        world = local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + corner
-        colour = np.array([0.88, 0.95, 1.05]) * float(rng.uniform(2.0, 3.5)) * (x1 - x0) * (z1 - z0)
-        lights.append(Light(world, colour, np.array([s, -c, 0.0])))
-    return lights

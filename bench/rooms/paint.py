@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from bench.rooms import materials as ma
 from bench.rooms import prints
 from bench.rooms import textures as tx
 from bench.rooms.textures import Colour, Image, Texture
@@ -42,12 +43,12 @@ class Paint:
     def wood(self, colour: Colour | None = None) -> Texture:
         """Furniture wood, 1.6 x 0.6 m of it."""
         colour = tx.pick(self.rng, tx.WOODS) if colour is None else colour
-        return self.finish(tx.wood(self.rng, tx.texels((1.6, 0.6), FINE_M), FINE_M, colour), FINE_M)
+        return self.finish(ma.wood(self.rng, tx.texels((1.6, 0.6), FINE_M), FINE_M, colour), FINE_M)
 
     def fabric(self, colour: Colour | None = None) -> Texture:
         """Upholstery, 1 x 1 m of it."""
         colour = tx.pick(self.rng, tx.CLOTHS) if colour is None else colour
-        return self.finish(tx.fabric(self.rng, tx.texels((1.0, 1.0), FINE_M), FINE_M, colour), FINE_M)
+        return self.finish(ma.fabric(self.rng, tx.texels((1.0, 1.0), FINE_M), FINE_M, colour), FINE_M)
 
     def glaze(self) -> Texture:
         """Ceramics: speckled glaze with painted rings."""
@@ -71,7 +72,7 @@ class Paint:
     def floor(self, size: tuple[float, float]) -> Texture:
         """Boards, tiles or carpet for a floor of (width, depth) m."""
         make: tuple[tuple[Callable[..., Image], tuple[Colour, ...]], ...] = (
-            (tx.planks, tx.WOODS), (tx.planks, tx.WOODS), (tx.tiles, tx.WALLS), (tx.carpet, tx.CLOTHS),
+            (ma.planks, tx.WOODS), (ma.planks, tx.WOODS), (ma.tiles, tx.WALLS), (ma.carpet, tx.CLOTHS),
         )  # fmt: skip
         draw, colours = make[int(self.rng.integers(len(make)))]
         return self.finish(draw(self.rng, tx.texels(size, WALL_M), WALL_M, tx.pick(self.rng, colours)), WALL_M)
@@ -84,18 +85,18 @@ class Paint:
         for k, size in enumerate(sizes):
             shape = tx.texels(size, WALL_M)
             if k == accent and kind == 1:
-                image = tx.bricks(self.rng, shape, WALL_M, tx.pick(self.rng, ((0.58, 0.33, 0.25), (0.78, 0.74, 0.70))))
+                image = ma.bricks(self.rng, shape, WALL_M, tx.pick(self.rng, ((0.58, 0.33, 0.25), (0.78, 0.74, 0.70))))
             elif k == accent and kind == 2:
-                image = tx.wallpaper(self.rng, shape, WALL_M, tx.pick(self.rng, tx.WALLS))
+                image = ma.wallpaper(self.rng, shape, WALL_M, tx.pick(self.rng, tx.WALLS))
             else:
-                image = tx.plaster(self.rng, shape, WALL_M, colour)
+                image = ma.plaster(self.rng, shape, WALL_M, colour)
             out.append(self.finish(image, WALL_M))
         return out
 
     def ceiling(self, size: tuple[float, float]) -> Texture:
         """White plaster."""
         texel = 2 * WALL_M
-        return self.finish(tx.plaster(self.rng, tx.texels(size, texel), texel, (0.90, 0.89, 0.87)), texel)
+        return self.finish(ma.plaster(self.rng, tx.texels(size, texel), texel, (0.90, 0.89, 0.87)), texel)
 
     def printed(
         self, size: tuple[float, float], draw: Callable[..., Image], *extra: float, glow: float = 0.0

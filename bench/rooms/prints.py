@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from bench.rooms import materials
 from bench.rooms import textures as tx
 from bench.rooms.textures import Colour, Image
 
@@ -126,7 +129,7 @@ def spines(rng: np.random.Generator, shape: tuple[int, int], count: int) -> Imag
     height, width = shape
     image = np.zeros((height, width, 3), np.float32)
     edges = np.linspace(0, width, count + 1).astype(int)
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in pairwise(edges):
         spine = np.empty((height, right - left, 3), np.float32)
         spine[:] = tx.pick(rng, tx.VIVID, 0.08)
         ink = tuple(float(c) for c in tx.pick(rng, tx.VIVID))
@@ -187,7 +190,7 @@ def parcel(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> 
 def door_leaf(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> Image:
     """Door with recessed panels, in wood or paint. HxWx3."""
     colour = tx.pick(rng, (*tx.WOODS, (0.85, 0.84, 0.80)))
-    image = np.ascontiguousarray(tx.wood(rng, shape[::-1], texel_m, colour).transpose(1, 0, 2))
+    image = np.ascontiguousarray(materials.wood(rng, shape[::-1], texel_m, colour).transpose(1, 0, 2))
     height, width = shape
     for y0, y1 in ((0.07, 0.45), (0.53, 0.93)):
         for x0, x1 in ((0.13, 0.46), (0.54, 0.87)):

@@ -13,25 +13,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from bench.rooms import shading
+from bench.rooms.lights import Light
 from bench.rooms.mesh import LABELS, Array, Part
 
 Float32Array = npt.NDArray[np.float32]
 DEFAULT_NOISE_SIGMA = 1.5  # grey levels of 255
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """An area light as points.
-
-    Args:
-        points: 16x3 m.
-        power: 3, linear RGB.
-        normal: 3 unit for one that shines to one side (a window), None for all sides.
-    """
-
-    points: Array
-    power: Array
-    normal: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +72,8 @@ class Room:
         first = np.cumsum([0] + [int(p.patch.max()) + 1 for p in parts])
         self.patch = np.concatenate([p.patch + k for p, k in zip(parts, first[:-1], strict=True)]).astype(np.int32)
         self._scene = EmbreeScene(robust=True)
-        TriangleMesh(self._scene, self.corners.reshape(-1, 3), np.arange(3 * len(self.corners), dtype=np.int32).reshape(-1, 3))
+        index3 = np.arange(3 * len(self.corners), dtype=np.int32).reshape(-1, 3)
+        TriangleMesh(self._scene, self.corners.reshape(-1, 3), index3)
         self.gain = 1.0
         self.gain = shading.room_gain(self)
 
@@ -135,4 +122,5 @@ class Room:
         light = shading.radiance(self, T, K, width, height, supersample, hits)
         if not isinstance(rng, np.random.Generator):
             rng = np.random.default_rng([self.seed, 7] if rng is None else rng)
-        return Rendering(shading.develop(light, exposure * self.gain, noise_sigma, rng), depth.astype(np.float32), labels)
+        rgb = shading.develop(light, exposure * self.gain, noise_sigma, rng)
+        return Rendering(rgb, depth.astype(np.float32), labels)

@@ -124,7 +124,7 @@ def _surface(
     which = room.texture[face]
     tilt = np.abs(np.einsum("ij,ij->i", normals, rays)) / np.linalg.norm(rays, axis=1)
     spot = hits.t * np.float32(pixel) / np.sqrt(np.maximum(tilt, 0.05))
-    level = np.clip(np.round(np.log2(spot / texel[which] + 1e-6) + 0.25), 0, top[which]).astype(np.int16)
+    level = np.clip(np.round(np.log2(spot / texel[which] + 1e-6)), 0, top[which]).astype(np.int16)
     key = which * np.int16(8) + level
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[order], prepend=np.int16(-1)))

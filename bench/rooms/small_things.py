@@ -54,7 +54,8 @@ def vase(paint: Paint, rng: np.random.Generator) -> list[Part]:
     h, r = rng.uniform(0.15, 0.3), rng.uniform(0.05, 0.09)
     t = np.linspace(0, 1, 14)
     bulge = 0.55 + 0.45 * np.sin(np.pi * (0.15 + rng.uniform(0.6, 0.9) * t)) ** 2
-    profile = [(0.0, 0.0), *zip(r * bulge, h * t, strict=True), (0.8 * r * bulge[-1], h), (0.5 * r * bulge[-1], h - 0.05)]
+    mouth = r * bulge[-1]
+    profile = [(0.0, 0.0), *zip(r * bulge, h * t, strict=True), (0.8 * mouth, h), (0.5 * mouth, h - 0.05)]
     parts = [lathe(profile, paint.glaze(), "vase")]
     if rng.random() < 0.5:
         parts += _leaves(paint, rng, np.array([0, 0, h - 0.03]), 14, 0.22, 0.035)
@@ -79,8 +80,11 @@ def _leaves(
 def plant(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Large plant in a pot for the floor."""
     r, h = rng.uniform(0.13, 0.18), rng.uniform(0.26, 0.36)
-    pot = lathe([(0.0, 0.0), (0.75 * r, 0.0), (r, h), (0.9 * r, h), (0.88 * r, h - 0.03), (0.0, h - 0.03)],
-                paint.glaze(), "vase")
+    pot = lathe(
+        [(0.0, 0.0), (0.75 * r, 0.0), (r, h), (0.9 * r, h), (0.88 * r, h - 0.03), (0.0, h - 0.03)],
+        paint.glaze(),
+        "vase",
+    )
     leaves = _leaves(paint, rng, np.array([0, 0, h - 0.04]), int(rng.integers(26, 40)), rng.uniform(0.5, 0.75), 0.08)
     return moved([pot, *leaves], shift=(0, -0.32, 0))
 
@@ -110,8 +114,15 @@ def stand_picture(paint: Paint, rng: np.random.Generator) -> list[Part]:
     w, h = rng.uniform(0.14, 0.24), rng.uniform(0.18, 0.28)
     front = paint.printed((w, h), prints.picture)
     parts = [box((-w / 2, -0.01, 0), (w / 2, 0.0, h), front, "picture", faces=("front",))]
-    parts.append(box((-w / 2, -0.01, 0), (w / 2, 0.008, h), paint.plain((0.2, 0.16, 0.12)), "picture",
-                     faces=("left", "right", "top", "back")))
+    parts.append(
+        box(
+            (-w / 2, -0.01, 0),
+            (w / 2, 0.008, h),
+            paint.plain((0.2, 0.16, 0.12)),
+            "picture",
+            faces=("left", "right", "top", "back"),
+        )
+    )
     tilt = -0.18
     R = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     return [p.transformed(R, (0, 0, 0)) for p in parts]
@@ -120,7 +131,8 @@ def stand_picture(paint: Paint, rng: np.random.Generator) -> list[Part]:
 def table_lamp(paint: Paint, rng: np.random.Generator) -> list[Part]:
     """Lamp with a ceramic foot."""
     r = rng.uniform(0.1, 0.14)
-    foot = lathe([(0.0, 0.0), (0.06, 0.0), (0.075, 0.06), (0.03, 0.17), (0.012, 0.2), (0.012, 0.3)], paint.glaze(), "lamp")
+    profile = [(0.0, 0.0), (0.06, 0.0), (0.075, 0.06), (0.03, 0.17), (0.012, 0.2), (0.012, 0.3)]
+    foot = lathe(profile, paint.glaze(), "lamp")
     return [foot, lathe([(r, 0.24), (0.6 * r, 0.42)], paint.fabric((0.84, 0.78, 0.64)), "lamp")]
 
 
