@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--depth-noise", choices=DEPTH_NOISES, default="none")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    pair = make_pair(args.seed, args.level, args.texture, *args.size, depth_noise=args.depth_noise)
+    pair = make_pair(args.seed, args.level, args.texture, args.size[0], args.size[1], args.depth_noise)
     path = save(pair, args.out, f"room{args.seed}_level{args.level}_texture{args.texture:g}")
     print(f"{path}  overlap {pair.overlap:.2f}")
 

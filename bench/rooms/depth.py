@@ -80,7 +80,7 @@ def _jumps(log_depth: Float32Array, valid: BoolArray) -> npt.NDArray[np.uint8]:
     kernel = np.ones((3, 3), np.uint8)
     high = cv2.dilate(np.where(valid, log_depth, np.float32(-1e3)), kernel)
     low = cv2.erode(np.where(valid, log_depth, np.float32(1e3)), kernel)
-    return (valid & (high - low > np.log(JUMP_RATIO))).astype(np.uint8)
+    return np.asarray(valid & (high - low > np.log(JUMP_RATIO)), np.uint8)
 
 
 def _blur_at_jumps(log_depth: Float32Array, valid: BoolArray) -> Float32Array:
@@ -114,7 +114,8 @@ def _sensor_holes(clean: Float32Array, valid: BoolArray, rng: np.random.Generato
     slope = np.hypot(_gradient(log_depth, valid, 1), _gradient(log_depth, valid, 0)) * reference
     lost_grazing = np.clip((slope - 0.012) / 0.03, 0, 1)
     lost_far = np.clip((clean - 0.8 * far_m) / (0.2 * far_m), 0, 1)
-    return (edges & (level < 0.8)) | (level < lost_grazing) | (level < lost_far) | (clean > far_m) | (chance < 0.001)
+    lost = (edges & (level < 0.8)) | (level < lost_grazing) | (level < lost_far)
+    return np.asarray(lost | (clean > far_m) | (chance < 0.001), bool)
 
 
 def _gradient(values: Float32Array, valid: BoolArray, axis: int) -> Float32Array:
@@ -126,4 +127,4 @@ def _gradient(values: Float32Array, valid: BoolArray, axis: int) -> Float32Array
     shape[axis] = 1
     zero = np.zeros(shape, np.float32)
     forward, backward = np.concatenate([step, zero], axis), np.concatenate([zero, step], axis)
-    return np.minimum(forward, backward).astype(np.float32)
+    return np.asarray(np.minimum(forward, backward), np.float32)

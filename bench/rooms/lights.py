@@ -40,7 +40,7 @@ def ceiling_lamp(paint: Paint, rng: np.random.Generator, size: Array) -> tuple[l
     spread = 0.22 * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)
     disc = np.stack([spread * np.cos(turn), spread * np.sin(turn), np.zeros(POINTS)], axis=1)
     power = np.array([1.0, 0.93, 0.82]) * float(rng.uniform(1.6, 2.6))
-    light = Light(disc + (x, y, float(size[2]) - 0.3), power, None)
+    light = Light(disc + np.array([x, y, float(size[2]) - 0.3]), power, None)
     return moved(lamp, shift=(x, y, float(size[2]) - 0.28)), light
 
 

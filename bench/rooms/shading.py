@@ -47,7 +47,7 @@ def radiance(
     light = _irradiance(room, points, normals, open_to)
     out = albedo * (light + glow[:, None])
     out[hits.face < 0] = 0
-    return cv2.resize(out.reshape(*fine, 3), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(out.reshape(*fine, 3), (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _look(room: Room, T: Array, K: Array, width: int, height: int, samples: int) -> tuple[Float32Array, Hits]:
@@ -220,4 +220,4 @@ def develop(light: Float32Array, exposure: float, sigma: float, rng: np.random.G
     x = np.maximum(light * np.float32(exposure), 0)
     tone = (1 - np.exp(-1.25 * x)) ** np.float32(1 / 2.2)
     noise = rng.standard_normal(tone.shape, dtype=np.float32) * np.float32(sigma)
-    return np.clip(np.round(255 * tone + noise), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.round(255 * tone + noise), 0, 255), np.uint8)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 Image = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
-Colour = Sequence[float]
+Colour = Sequence[float] | npt.NDArray[np.floating[Any]]
 
 MIP_LEVELS = 5
 PLAIN_CONTRAST = 0.02  # what is left of a texture at strength 0
@@ -95,17 +96,21 @@ def noise(
         gain: amplitude ratio between an octave and the one before.
     """
     height, width = shape
-    total, weight = np.zeros(shape, np.float32), 0.0
+    quarter = (max(height // 4, 1), max(width // 4, 1))
+    coarse, fine, weight = np.zeros(quarter, np.float32), np.zeros(shape, np.float32), 0.0
     for octave in range(octaves):
-        rows = max(round(height / cell[0] * 2**octave), 1)
-        cols = max(round(width / cell[1] * 2**octave), 1)
-        if rows > height or cols > width:
-            rows, cols = min(rows, height), min(cols, width)
+        rows = min(max(round(height / cell[0] * 2**octave), 1), height)
+        cols = min(max(round(width / cell[1] * 2**octave), 1), width)
         lattice = rng.uniform(-1, 1, (rows, cols)).astype(np.float32)
-        smooth = max(height / rows, width / cols) > 5
-        total += gain**octave * _stretch(lattice, shape, cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR)
+        if min(height / rows, width / cols) > 16:  # smooth enough to be drawn small and enlarged
+            coarse += gain**octave * _stretch(lattice, quarter, cv2.INTER_CUBIC)
+        else:
+            smooth = max(height / rows, width / cols) > 5
+            fine += gain**octave * _stretch(lattice, shape, cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR)
         weight += gain ** (2 * octave)
-    return (total / np.float32(np.sqrt(weight))).astype(np.float32)
+    if coarse.any():
+        fine += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return (fine * np.float32(1 / np.sqrt(weight))).astype(np.float32)
 
 
 def _stretch(lattice: Image, shape: tuple[int, int], kernel: int) -> Image:
@@ -118,10 +123,10 @@ def _stretch(lattice: Image, shape: tuple[int, int], kernel: int) -> Image:
     return np.asarray(cv2.warpAffine(padded, M, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def tint(colour: Colour, brightness: Image, warmth: Image | float = 0.0) -> Image:
+def tint(colour: Colour, brightness: npt.NDArray[np.floating[Any]], warmth: Image | float = 0.0) -> Image:
     """Base colour times (1 + brightness), shifted a little between blue and red by `warmth`."""
     base = np.asarray(colour, np.float32)
-    lit = base * (1 + brightness[..., None])
+    lit = (base * (1 + brightness[..., None])).astype(np.float32)
     lit[..., 0] += 0.5 * warmth
     lit[..., 2] -= 0.5 * warmth
     return np.asarray(lit, np.float32)
