@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m bench.demo`: GARPS on twelve recorded stereo pairs and in a generated room, with pictures.
+
+1. Stereo: depth for both cameras by a stereo matcher, written to a rosbag2 as a robot would record it, replayed by
+   `garps-replay`. The truth is the calibrated baseline. (The depth was made with the same baseline: what is tested is
+   the alignment, not the depth.)
+2. Room: two views 0.6 m and 20 degrees apart with a depth sensor's noise; the truth is exact.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+import typer
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from bench.demo_bag import stamp_ns_of, write_bag
+from bench.rooms import make_pair
+from bench.stereo import StereoPair, depth_of_both, load_pairs
+from garps_core import View, estimate_relative_pose, reconstruct
+from garps_core.figure import before_after
+from garps_ros.replay import main as replay
+
+LIMIT_MM = 5.0
+"""Median error of the estimated baseline above which the demo fails."""
+PICTURE = "living_room"
+ROOM_SEED, ROOM_LEVEL = 3, 4
+
+Array = npt.NDArray[np.float64]
+console = Console()
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A row of the replay's poses.csv: T is 4x4 or None, sigma the translation's in m."""
+
+    status: str
+    T: Array | None
+    sigma: Array | None
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for the bag, poses.csv and the pictures.")] = Path("out/demo"),
+    scenes: Annotated[int, typer.Option(help="Use the first so many stereo pairs.", min=1)] = 12,
+) -> int:
+    """Run both parts; exit code 0 when the median baseline error is below the limit."""
+    begin = time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
+    good = stereo_part(out, scenes)
+    room_part(out)
+    console.print(f"\nEverything is in [bold]{out}[/bold]; {time.perf_counter() - begin:.0f} s.")
+    return 0 if good else 1
+
+
+def stereo_part(out: Path, scenes: int) -> bool:
+    """Bag, replay, table, picture."""
+    console.rule("Recorded stereo pairs: does the estimate find the calibrated baseline?")
+    pairs = load_pairs()[:scenes]
+    depths = [depth_of_both(pair) for pair in track(pairs, "stereo depth of both cameras", console=console)]
+    for folder in ("bag", "replay"):
+        shutil.rmtree(out / folder, ignore_errors=True)
+    write_bag(out / "bag", [(pair, *depth) for pair, depth in zip(pairs, depths, strict=True)])
+    command = [str(out / "bag"), "--out", str(out / "replay")]
+    command += ["--source-image", "/left/image_rect", "--target-image", "/right/image_rect"]
+    console.print(f"$ garps-replay {' '.join(command)}", soft_wrap=True)
+    if replay(command) not in (0, 1):
+        return False
+    estimates = read_poses(out / "replay" / "poses.csv")
+    rows = [estimates.get(stamp_ns_of(i)) for i in range(len(pairs))]
+    draw_stereo(pairs, depths, rows, out / "stereo_before_after.png")
+    return report_stereo(pairs, rows)
+
+
+def read_poses(path: Path) -> dict[int, Estimate]:
+    """Source stamp -> estimate."""
+    found = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            T = sigma = None
+            if row["tx"]:
+                T = np.eye(4)
+                T[:3, 3] = [float(row[name]) for name in ("tx", "ty", "tz")]
+                T[:3, :3] = Rotation.from_quat([float(row[name]) for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+            if row["c00"]:
+                sigma = np.sqrt([float(row[name]) for name in ("c00", "c11", "c22")])
+            found[int(row["source_stamp_ns"])] = Estimate(row["status"], T, sigma)
+    return found
+
+
+def errors(T: Array, truth: Array) -> tuple[float, float]:
+    """Millimetres and degrees."""
+    turn = Rotation.from_matrix(T[:3, :3] @ truth[:3, :3].T).magnitude()
+    return 1000 * float(np.linalg.norm(T[:3, 3] - truth[:3, 3])), float(np.degrees(turn))
+
+
+def report_stereo(pairs: list[StereoPair], rows: list[Estimate | None]) -> bool:
+    """Print the table; whether the median error of the baseline's length is below the limit."""
+    table = Table(title="Left camera in the right one; truth: -75 0 0 mm, 0 deg", box=SIMPLE, padding=(0, 1, 0, 0))
+    for heading in ("scene", "status", "x y z mm", "sigma mm", "baseline error mm", "rotation error deg"):
+        table.add_column(heading, justify="left" if heading in ("scene", "status") else "right")
+    misses = []
+    for pair, row in zip(pairs, rows, strict=True):
+        if row is None or row.T is None:
+            table.add_row(pair.name, row.status if row else "not estimated", *["-"] * 4)
+            misses.append(np.inf)
+            continue
+        miss = 1000 * abs(float(np.linalg.norm(row.T[:3, 3])) - pair.baseline_m)
+        misses.append(miss)
+        sigma = "-" if row.sigma is None else f"{1000 * float(np.linalg.norm(row.sigma)):.1f}"
+        where = "\u00a0".join(f"{1000 * x:+.1f}" for x in row.T[:3, 3])
+        table.add_row(pair.name, row.status, where, sigma, f"{miss:.1f}", f"{errors(row.T, pair.T_right_left)[1]:.2f}")
+    console.print(table)
+    median = float(np.median(misses))
+    verdict = "[green]good[/green]" if median < LIMIT_MM else "[red]too much[/red]"
+    console.print(f"Median baseline error [bold]{median:.1f} mm[/bold] (expected below {LIMIT_MM:g}): {verdict}")
+    console.print("Images: N. Burrus, CC BY 4.0, from the package stereodemo.", style="dim")
+    return median < LIMIT_MM
+
+
+def draw_stereo(
+    pairs: list[StereoPair],
+    depths: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]],
+    rows: list[Estimate | None],
+    path: Path,
+) -> None:
+    """The picture of one scene: both mixtures at one place (no motion), and at the estimate."""
+    index = next((i for i, pair in enumerate(pairs) if pair.name == PICTURE), 0)
+    pair, row, (left, right) = pairs[index], rows[index], depths[index]
+    if row is None or row.T is None:
+        return
+    source, target = (reconstruct(View(rgb, pair.K, d)) for rgb, d in ((pair.left, left), (pair.right, right)))
+    before_after(source, target, np.eye(4), row.T, path, f"Stereo pair '{pair.name}': no motion, and the estimate")
+    console.print(f"picture: {path}")
+
+
+def room_part(out: Path) -> None:
+    """Two views of a generated room: error against exact truth, and the picture."""
+    console.rule("Generated room: a larger motion, exact truth")
+    with console.status("rendering and aligning"):
+        pair = make_pair(ROOM_SEED, ROOM_LEVEL, depth_noise="sensor")
+        source, target = View(pair.rgb0, pair.K0, pair.depth0), View(pair.rgb1, pair.K1, pair.depth1)
+        estimate = estimate_relative_pose(source, target)
+    T = estimate.T_target_source
+    console.print(f"status {estimate.status.value} {estimate.reason}".rstrip())
+    if T is None:
+        return
+    length, _ = errors(pair.T_1_0, np.eye(4))
+    turn = np.degrees(Rotation.from_matrix(pair.T_1_0[:3, :3]).magnitude())
+    millimetres, degrees = errors(T, pair.T_1_0)
+    console.print(
+        f"motion {length / 1000:.3f} m and {turn:.1f} deg, overlap {100 * pair.overlap:.0f} %: "
+        f"[bold]error {millimetres:.1f} mm, {degrees:.3f} deg[/bold]"
+    )
+    path = out / "room_before_after.png"
+    before_after(reconstruct(source), reconstruct(target), np.eye(4), T, path, "Room: no motion, and the estimate")
+    console.print(f"picture: {path}")
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command()(main)
+    sys.exit(app(standalone_mode=False))
