@@ -108,8 +108,8 @@ def errors(T: Array, truth: Array) -> tuple[float, float]:
 def report_stereo(pairs: list[StereoPair], rows: list[Estimate | None]) -> bool:
     """Print the table; whether the median error of the baseline's length is below the limit."""
     table = Table(title="Left camera in the right one; truth: -75 0 0 mm, 0 deg", box=SIMPLE, padding=(0, 1, 0, 0))
-    for heading in ("scene", "status", "x y z mm", "sigma mm", "baseline error mm", "rotation error deg"):
-        table.add_column(heading, justify="left" if heading in ("scene", "status") else "right")
+    for heading in ("scene", "status", "x y z\n[mm]", "sigma\n[mm]", "baseline\nerror [mm]", "rotation\nerror [deg]"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading in ("scene", "status") else "right")
     misses = []
     for pair, row in zip(pairs, rows, strict=True):
         if row is None or row.T is None:
@@ -119,7 +119,7 @@ def report_stereo(pairs: list[StereoPair], rows: list[Estimate | None]) -> bool:
         miss = 1000 * abs(float(np.linalg.norm(row.T[:3, 3])) - pair.baseline_m)
         misses.append(miss)
         sigma = "-" if row.sigma is None else f"{1000 * float(np.linalg.norm(row.sigma)):.1f}"
-        where = "\u00a0".join(f"{1000 * x:+.1f}" for x in row.T[:3, 3])
+        where = " ".join(f"{1000 * x:+.1f}" for x in row.T[:3, 3])
         table.add_row(pair.name, row.status, where, sigma, f"{miss:.1f}", f"{errors(row.T, pair.T_right_left)[1]:.2f}")
     console.print(table)
     median = float(np.median(misses))
