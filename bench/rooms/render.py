@@ -67,6 +67,7 @@ class Room:
         self.corners = np.concatenate([p.corners for p in parts]).astype(np.float32)
         self.uv = np.concatenate([p.uv for p in parts]).astype(np.float32)
         self.normals = np.concatenate([p.normals for p in parts]).astype(np.float32)
+        self.smooth = (self.normals != self.normals[:, :1]).any(axis=(1, 2))
         self.texture = np.repeat([index[id(p.texture)] for p in parts], counts).astype(np.int16)
         self.label = np.repeat([LABELS.index(p.label) for p in parts], counts).astype(np.int32)
         first = np.cumsum([0] + [int(p.patch.max()) + 1 for p in parts])

@@ -21,6 +21,7 @@ Float32Array = npt.NDArray[np.float32]
 TILE = 4  # shadow rays use 16 light points and directions, a different one at each place of a 4x4 tile
 AMBIENT = np.array([0.40, 0.41, 0.43], np.float32)
 OCCLUSION_M = 0.45
+BAND_ROWS = 24
 MID_GREY = 0.33
 TO_LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
 
@@ -33,27 +34,40 @@ def radiance(
     Surfaces are sampled on the fine grid; visibility, the expensive part, once per pixel. `centre` are the hits of
     the pixel centres, if they are known.
     """
-    rays, hits = _look(room, T, K, width, height, samples)
+    patch, open_to = _pixel_visibility(room, T, K, (height, width), centre)
+    out = np.empty((height, width, 3), np.float32)
+    for top in range(0, height, BAND_ROWS):  # bands fit into the processor's cache
+        bottom = min(top + BAND_ROWS, height)
+        shifted = K.copy()
+        shifted[1, 2] -= top
+        light = _band(room, T, shifted, (bottom - top, width), samples, patch, open_to, top)
+        out[top:bottom] = cv2.resize(light, (width, bottom - top), interpolation=cv2.INTER_AREA)
+    return out
+
+
+def _band(
+    room: Room,
+    T: Array,
+    K: Array,
+    size: tuple[int, int],
+    samples: int,
+    patch: npt.NDArray[np.int32],
+    open_to: Float32Array,
+    top: int,
+) -> Float32Array:
+    """Light (h s)x(w s)x3 of the samples of `size` pixels, the first row being row `top` of the visibility map."""
+    height, width = size
+    rays = camera_rays(K, width, height, samples).reshape(-1, 3) @ T[:3, :3].T.astype(np.float32)
+    hits = room.cast(T[:3, 3], rays)
     face = np.maximum(hits.face, 0)
     normals = _normals(room, hits, face, rays)
     albedo, glow = _surface(room, hits, face, normals, rays, 1 / (K[0, 0] * samples))
     points = T[:3, 3].astype(np.float32) + rays * hits.t[:, None]
-    fine = (height * samples, width * samples)
-    if samples == 1:
-        patch = room.patch[face].reshape(fine)
-        open_to = _visibility(room, points, normals, patch)
-    else:
-        open_to = _pixel_visibility(room, T, K, (height, width), centre, room.patch[face].reshape(fine), samples)
-    light = _irradiance(room, points, normals, open_to)
+    fine = room.patch[face].reshape(height * samples, width * samples)
+    light = _irradiance(room, points, normals, open_to[_source(patch, fine, samples, top)])
     out = albedo * (light + glow[:, None])
     out[hits.face < 0] = 0
-    return np.asarray(cv2.resize(out.reshape(*fine, 3), (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _look(room: Room, T: Array, K: Array, width: int, height: int, samples: int) -> tuple[Float32Array, Hits]:
-    """World rays Nx3 of all samples, and where they end."""
-    rays = camera_rays(K, width, height, samples).reshape(-1, 3) @ T[:3, :3].T.astype(np.float32)
-    return rays, room.cast(T[:3, 3], rays)
+    return np.asarray(out.reshape(*fine.shape, 3), np.float32)
 
 
 def camera_rays(K: Array, width: int, height: int, samples: int = 1) -> Float32Array:
@@ -67,25 +81,24 @@ def camera_rays(K: Array, width: int, height: int, samples: int = 1) -> Float32A
 
 
 def _pixel_visibility(
-    room: Room,
-    T: Array,
-    K: Array,
-    size: tuple[int, int],
-    hits: Hits | None,
-    fine: npt.NDArray[np.int32],
-    samples: int,
-) -> Float32Array:
-    """Visibility at pixel centres, handed to the fine samples (patch ids HsxWs) of the same surface."""
+    room: Room, T: Array, K: Array, size: tuple[int, int], hits: Hits | None
+) -> tuple[npt.NDArray[np.int32], Float32Array]:
+    """Patch ids HxW at the pixel centres, and their visibility (H W)x(1+L)."""
     height, width = size
     rays = camera_rays(K, width, height).reshape(-1, 3) @ T[:3, :3].T.astype(np.float32)
     hits = room.cast(T[:3, 3], rays) if hits is None else hits
     face = np.maximum(hits.face, 0)
     patch = room.patch[face].reshape(size)
     points = T[:3, 3].astype(np.float32) + rays * hits.t[:, None]
-    coarse = _visibility(room, points, _normals(room, hits, face, rays), patch).reshape(height * width, -1)
-    rows = np.repeat(np.arange(height), samples)[:, None]
-    cols = np.repeat(np.arange(width), samples)[None, :]
-    source = (rows * width + cols).ravel()
+    return patch, _visibility(room, points, _normals(room, hits, face, rays), patch)
+
+
+def _source(patch: npt.NDArray[np.int32], fine: npt.NDArray[np.int32], samples: int, top: int) -> npt.NDArray[np.int64]:
+    """For each fine sample, the pixel (flat index) of the same surface whose visibility it takes."""
+    height, width = patch.shape
+    rows = np.arange(fine.shape[0])[:, None] // samples + top
+    cols = np.arange(fine.shape[1])[None, :] // samples
+    source = np.asarray(rows * width + cols, np.int64).ravel()
     flat, wanted = patch.ravel(), fine.ravel()
     # At an edge the pixel's centre is on another surface for some samples: look for theirs among the neighbours.
     lost = np.flatnonzero(flat[source] != wanted)
@@ -95,15 +108,14 @@ def _pixel_visibility(
         found = flat[near] == wanted[lost]
         source[lost[found]] = near[found]
         lost, y, x = lost[~found], y[~found], x[~found]
-    return np.asarray(coarse[source], np.float32)
+    return source
 
 
 def _normals(room: Room, hits: Hits, face: npt.NDArray[np.int64], rays: Float32Array) -> Float32Array:
     """Nx3 unit shading normals that look towards the camera."""
     corner = room.normals[:, 0]
-    smooth = (room.normals != room.normals[:, :1]).any(axis=(1, 2))
     out = corner[face]
-    bent = np.flatnonzero(smooth[face])
+    bent = np.flatnonzero(room.smooth[face])
     n, u, v = room.normals[face[bent]], hits.u[bent, None], hits.v[bent, None]
     mixed = (1 - u - v) * n[:, 0] + u * n[:, 1] + v * n[:, 2]
     out[bent] = mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-6)
