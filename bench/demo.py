@@ -108,7 +108,7 @@ def errors(T: Array, truth: Array) -> tuple[float, float]:
 def report_stereo(pairs: list[StereoPair], rows: list[Estimate | None]) -> bool:
     """Print the table; whether the median error of the baseline's length is below the limit."""
     table = Table(title="Left camera in the right one; truth: -75 0 0 mm, 0 deg", box=SIMPLE, padding=(0, 1, 0, 0))
-    for heading in ("scene", "status", "x y z\n[mm]", "sigma\n[mm]", "baseline\nerror [mm]", "rotation\nerror [deg]"):
+    for heading in ("scene", "status", "x y z\nmm", "sigma\nmm", "baseline\nerror mm", "rotation\nerror deg"):
         table.add_column(heading, no_wrap=True, justify="left" if heading in ("scene", "status") else "right")
     misses = []
     for pair, row in zip(pairs, rows, strict=True):
