@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames in, outcomes out: every pair becomes an estimate, or the reason why there is none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from garps_core.errors import GarpsError, InputError
+from garps_core.types import Float64Array, PoseEstimate, View
+from garps_ros.frames import Frame, Frames
+from garps_ros.outputs import Row
+from garps_ros.tracking import Estimator, KeyframeTracker
+from garps_ros.views import view_from_messages
+from msg_adapters import MessageError, header_frame_id
+
+MALFORMED, INVALID, NO_MIXTURE = "malformed_message", "invalid_input", "no_reconstruction"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A trajectory begins; with a stamp, its first pose is the identity at that time."""
+
+    segment: int
+    frame_id: str
+    child_frame_id: str
+    stamp_ns: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A pair: its row, and what to publish (None: nothing).
+
+    Args:
+        row: of poses.csv.
+        frame_id: frame in which `T` places the camera.
+        child_frame_id: frame of the camera.
+        T: 4x4, the camera in `frame_id`.
+        covariance: 6x6 of `T` in the ROS meaning.
+        seconds: wall time from messages to pose.
+    """
+
+    row: Row
+    frame_id: str
+    child_frame_id: str
+    T: Float64Array | None
+    covariance: Float64Array | None
+    seconds: float | None
+
+
+class ViewReader:
+    """Frame -> View; says which calibration is used, once and whenever that changes.
+
+    Args:
+        rectified: "auto", "true" or "false".
+        say: called with a line for people.
+    """
+
+    def __init__(self, rectified: str, say: Callable[[str], None]) -> None:
+        self._rectified, self._say = rectified, say
+        self._said: dict[str, str] = {}
+
+    def read(self, frame: Frame) -> View:
+        """Decode, choose the calibration, undistort. Raises MessageError or InputError."""
+        topic = frame.topics.image
+        view, decision = view_from_messages(
+            frame.image, frame.info, frame.depth, topic=topic, rectified=self._rectified
+        )
+        if self._said.get(topic) != decision:
+            self._said[topic] = decision
+            self._say(f"{topic}: {decision}")
+        return view
+
+
+def estimate_pairs(frames: Frames, reader: ViewReader, estimate: Estimator) -> Iterator[Origin | Outcome]:
+    """Two cameras: the pose of the first of `frames` (source) in the second (target), pair by pair."""
+    begun = False
+    for source, target in frames.pairs():
+        began = time.perf_counter()
+        target_name, source_name = _two_names(target, source)
+        if not begun:
+            yield Origin(0, target_name, source_name)
+            begun = True
+        names, stamps = (source_name, target_name), (source.stamp_ns, target.stamp_ns)
+        try:
+            found = estimate(reader.read(source), reader.read(target))
+        except (MessageError, GarpsError) as error:
+            yield Outcome(_failed(stamps, names, 0, error), target_name, source_name, None, None, None)
+            continue
+        T, covariance = (found.T_target_source, found.covariance) if found.ok else (None, None)
+        seconds = time.perf_counter() - began
+        yield Outcome(_row(stamps, names, 0, found), target_name, source_name, T, covariance, seconds)
+
+
+def estimate_keyframes(frames: Frames, reader: ViewReader, tracker: KeyframeTracker) -> Iterator[Origin | Outcome]:
+    """One camera: its pose in the first keyframe of the segment; rows hold the pose in the keyframe that was used."""
+    for frame in frames.singles():
+        began = time.perf_counter()
+        name = header_frame_id(frame.image) or _topic_name(frame)
+        start = f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
+        try:
+            view = reader.read(frame)
+            if tracker.begins(view):
+                start = f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
+                yield Origin(tracker.segment, start, name, view.stamp_ns)
+                continue
+            for attempt in tracker.follow(view):
+                stamps = frame.stamp_ns, attempt.target.stamp_ns
+                row = _row(stamps, (name, name), tracker.segment, attempt.estimate)
+                seconds = time.perf_counter() - began
+                yield Outcome(row, start, name, attempt.T_start_source, attempt.covariance, seconds)
+                began = time.perf_counter()
+        except (MessageError, GarpsError) as error:
+            stamps = frame.stamp_ns, tracker.keyframe_stamp_ns
+            yield Outcome(_failed(stamps, (name, name), tracker.segment, error), start, name, None, None, None)
+
+
+def _two_names(target: Frame, source: Frame) -> tuple[str, str]:
+    """Frame names of both cameras; those of their topics where the drivers give none, or the same to both."""
+    names = header_frame_id(target.image), header_frame_id(source.image)
+    return names if all(names) and names[0] != names[1] else (_topic_name(target), _topic_name(source))
+
+
+def _topic_name(frame: Frame) -> str:
+    return frame.topics.image.strip("/").replace("/", "_")
+
+
+def _row(stamps: tuple[int, int], names: tuple[str, str], segment: int, found: PoseEstimate) -> Row:
+    pose = found.T_target_source, found.covariance
+    return Row(*stamps, *names, found.status.value, found.reason, found.overlap, *pose, segment)
+
+
+def _failed(stamps: tuple[int, int], names: tuple[str, str], segment: int, error: Exception) -> Row:
+    kind = MALFORMED if isinstance(error, MessageError) else INVALID if isinstance(error, InputError) else NO_MIXTURE
+    return Row(*stamps, *names, kind, str(error), segment=segment)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairing of two message streams by their stamps; the same rule offline and live."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+MAX_WAITING = 60
+
+
+class Pairer:
+    """Pairs items of two streams whose stamps differ by at most `slop_ns`; each item is used once.
+
+    Equal stamps always pair. Otherwise an item pairs with the nearest of the other stream unless that one is nearer
+    to (or equal to) another: an item is held back until its stream has shown the next one. Stamps must grow within
+    a stream; items that do not are refused, because after a jump back in time no order is left to rely on.
+
+    Args:
+        slop_ns: largest difference of a pair, nanoseconds; 0 = equal stamps only.
+    """
+
+    def __init__(self, slop_ns: int) -> None:
+        self.slop_ns = slop_ns
+        self.unpaired = [0, 0]
+        """Items of each stream that found no partner."""
+        self._waiting: tuple[deque[tuple[int, Any]], deque[tuple[int, Any]]] = (deque(), deque())
+        self._latest = [-1, -1]
+
+    def add(self, stream: int, stamp_ns: int, item: Any) -> list[tuple[Any, Any]] | None:
+        """Add an item to stream 0 or 1; returns the pairs that are now certain, or None if its stamp does not grow."""
+        if stamp_ns <= self._latest[stream]:
+            return None
+        self._latest[stream] = stamp_ns
+        self._waiting[stream].append((stamp_ns, item))
+        pairs = self._matched(finished=False)
+        if len(self._waiting[stream]) > MAX_WAITING:  # the other stream has stopped
+            self._drop(stream)
+        return pairs
+
+    def finish(self) -> list[tuple[Any, Any]]:
+        """The pairs that waited for a better partner which can no longer come."""
+        pairs = self._matched(finished=True)
+        for stream in (0, 1):
+            while self._waiting[stream]:
+                self._drop(stream)
+        return pairs
+
+    def _matched(self, finished: bool) -> list[tuple[Any, Any]]:
+        pairs = []
+        while self._waiting[0] and self._waiting[1]:
+            older = 0 if self._waiting[0][0][0] <= self._waiting[1][0][0] else 1
+            queue, newest = self._waiting[older], self._waiting[1 - older][0][0]
+            gap = newest - queue[0][0]
+            if gap > self.slop_ns or (len(queue) > 1 and abs(queue[1][0] - newest) < gap):
+                self._drop(older)
+            elif gap == 0 or len(queue) > 1 or finished:
+                pairs.append((self._waiting[0].popleft()[1], self._waiting[1].popleft()[1]))
+            else:
+                break
+        return pairs
+
+    def _drop(self, stream: int) -> None:
+        self._waiting[stream].popleft()
+        self.unpaired[stream] += 1

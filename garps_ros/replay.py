@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`garps-replay`: relative poses from a recording, offline and without ROS.
+
+Exit code 0 = at least one pose, 1 = none, 2 = wrong input, 130 = interrupted (what was written is valid).
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from garps_core.align import estimate_relative_pose
+from garps_core.config import Config
+from garps_core.errors import ConfigError
+from garps_core.types import PoseEstimate, View
+from garps_ros.bags import Bag, BagError
+from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
+from garps_ros.frames import Frames
+from garps_ros.outputs import Outputs
+from garps_ros.session import record, stop_on_signals
+from garps_ros.settings import changed_config
+from garps_ros.summary import Summary
+from garps_ros.topics import CameraTopics, choose_cameras
+from garps_ros.tracking import KeyframeRule, KeyframeTracker
+
+NAME = "garps-replay"
+INTERRUPTED = 130
+NANOSECONDS = 1_000_000_000
+ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
+ONE_OF_RECTIFIED = ("auto", "true", "false")
+
+# typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
+ClickException: type[Exception] = typer.BadParameter.__mro__[2]
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code. A user's mistake is one line on stderr and code 2."""
+    try:
+        code = app(args=arguments, prog_name=NAME, standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except (BagError, ConfigError) as error:
+        message = str(error)
+    except ClickException as error:
+        message = error.format_message()  # type: ignore[attr-defined]
+        if not message:  # no arguments: the help has been printed
+            return 2
+    except (typer.Abort, KeyboardInterrupt):
+        return INTERRUPTED
+    print(f"{NAME}: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+HELP = """Metric relative poses from a recording, offline and without ROS.
+
+Two cameras: the pose of the source camera in the target camera's frame, for every pair of images taken together.
+One camera: its path in the frame of its first image. Topics that are not given are guessed and printed.
+Every camera needs depth registered to its image.
+
+\b
+Writes into --out:
+  trajectory.tum  stamp, position, quaternion of the poses that can be used; frames in its first line
+  poses.csv       every pair, also rejected ones, with status, reason, pose, covariance and overlap
+  poses/          rosbag2 (MCAP) with /garps/pose and /garps/odometry
+\b
+Examples:
+  garps-replay walk/ --out walk_poses
+  garps-replay rig.mcap --source-image /right/image_raw --target-image /left/image_raw
+  garps-replay old.bag --pairing keyframe --set lifting.stride=4 --limit 20
+\b
+Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupted (what was written is valid).
+"""
+
+
+@app.command(help=HELP)
+def replay(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap, .db3 or ROS 1 .bag file.", metavar="BAG")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; must be new or empty.")] = Path("garps_replay"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier replay.")] = False,
+    source_image: Annotated[str, typer.Option(help="Image topic of the source camera.", metavar="TOPIC")] = "",
+    source_info: Annotated[str, typer.Option(help="Its CameraInfo.", metavar="TOPIC")] = "",
+    source_depth: Annotated[str, typer.Option(help="Its depth, registered to the image.", metavar="TOPIC")] = "",
+    target_image: Annotated[str, typer.Option(help="Image topic of the target camera.", metavar="TOPIC")] = "",
+    target_info: Annotated[str, typer.Option(help="Its CameraInfo.", metavar="TOPIC")] = "",
+    target_depth: Annotated[str, typer.Option(help="Its depth.", metavar="TOPIC")] = "",
+    pairing: Annotated[
+        str, typer.Option(help="cameras: two at the same time; keyframe: one over time; auto.")
+    ] = "auto",
+    slop: Annotated[
+        float, typer.Option(help="Largest difference of stamps that belong together, seconds.", min=0, max=10)
+    ] = 0.02,
+    rectified: Annotated[
+        str, typer.Option(help="Are the images rectified? auto (by topic name), true, false.")
+    ] = "auto",
+    keyframe_overlap: Annotated[
+        float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)
+    ] = 0.5,
+    keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
+    keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
+    limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
+    preset: Annotated[str, typer.Option(help="Settings: default, sensor, monocular or paper.")] = "default",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+    ] = None,
+) -> int:
+    """Replay; see HELP."""
+    _check_choice("--pairing", pairing, ONE_OF_PAIRING)
+    _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
+    config = changed_config(Config.preset(preset), set_ or [])
+    rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation))
+    source = CameraTopics(source_image, source_info, source_depth)
+    target = CameraTopics(target_image, target_info, target_depth)
+    with Bag(bag) as recording:
+        cameras = choose_cameras(recording, source, target, pairing)
+        with Outputs(out, overwrite) as outputs:
+            return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
+
+
+def _run(
+    bag: Bag,
+    cameras: list[CameraTopics],
+    outputs: Outputs,
+    config: Config,
+    rule: KeyframeRule,
+    slop_ns: int,
+    rectified: str,
+    limit: int | None,
+) -> int:
+    summary = Summary()
+    frames = Frames(bag, cameras, slop_ns, summary.refuse)
+    with stop_on_signals() as stopped:
+        # Plain text: "p[3]" in a reason is no markup, and a topic must not be broken over two lines.
+        console = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
+        with Progress(console=console, transient=True) as progress:
+            say = console.print
+            _say_choice(cameras, say)
+            outcomes = _outcomes(frames, ViewReader(rectified, say), config, rule, len(cameras))
+            expected = min(bag.counts[cameras[0].image], limit or sys.maxsize)
+            record(progress.track(outcomes, expected, description="frames"), outputs, summary, stopped, limit)
+        summary.unpaired, summary.broken_end = frames.unpaired(), bag.broken_end
+        Console(markup=False, emoji=False).print(summary.table())
+        return INTERRUPTED if stopped() else 0 if summary.used else 1
+
+
+def _outcomes(
+    frames: Frames, reader: ViewReader, config: Config, rule: KeyframeRule, cameras: int
+) -> Iterator[Origin | Outcome]:
+    def estimate(source: View, target: View) -> PoseEstimate:
+        return estimate_relative_pose(source, target, config)
+
+    if cameras == 2:
+        return estimate_pairs(frames, reader, estimate)
+    return estimate_keyframes(frames, reader, KeyframeTracker(estimate, rule))
+
+
+def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:
+    for name, camera in zip(("source", "target"), cameras, strict=False):
+        say(f"{name}: {camera}")
+    say("pose of source in target, pair by pair" if len(cameras) == 2 else "one camera against its keyframes")
+
+
+def _check_choice(option: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise BagError(f"{option} is {value!r}: expected one of {', '.join(choices)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a recording make a camera: as asked for, or guessed from types, names and first messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from garps_ros.bags import Bag, BagError
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPES = ("sensor_msgs/msg/CameraInfo",)
+TRANSPORTS = ("compressed", "compressedDepth")
+REGISTERED = ("aligned", "registered", "depth_to_rgb", "depth_to_color")
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """The topics of one camera; empty = not known yet."""
+
+    image: str = ""
+    info: str = ""
+    depth: str = ""
+
+    def __str__(self) -> str:
+        return f"image {self.image}, info {self.info}, depth {self.depth}"
+
+
+def choose_cameras(bag: Bag, source: CameraTopics, target: CameraTopics, pairing: str) -> list[CameraTopics]:
+    """The cameras to use: [source, target], or [source] when one camera is followed against its keyframes.
+
+    Args:
+        bag: an open recording.
+        source: topics that were asked for; empty ones are guessed.
+        target: likewise, of the second camera.
+        pairing: "cameras", "keyframe" or "auto" (two cameras when there are two).
+    Raises:
+        BagError: a topic that is missing or of another type, no depth, or no one guess; lists what is there.
+    """
+    _check_given(bag, source, target)
+    if pairing == "keyframe" and target != CameraTopics():
+        raise BagError("--pairing keyframe follows one camera: expected --source-... topics only")
+    if pairing == "auto":
+        pairing = _pairing(source, target, _cameras(bag))
+    if pairing == "keyframe":
+        return [_completed(bag, source, "source", CameraTopics(), alone=True)]
+    # Without names the alphabetically first camera (left, cam0, ...) is the reference: the target.
+    target = _completed(bag, target, "target", source)
+    source = _completed(bag, source, "source", target)
+    if source.image == target.image:
+        raise BagError(f"source and target are both {source.image}: expected two cameras, or --pairing keyframe")
+    return [source, target]
+
+
+def _check_given(bag: Bag, *cameras: CameraTopics) -> None:
+    for camera in cameras:
+        for topic, kinds in ((camera.image, IMAGE_TYPES), (camera.info, INFO_TYPES), (camera.depth, IMAGE_TYPES)):
+            if topic and topic not in bag.types:
+                raise BagError(f"topic {topic} is not in the recording: expected one of {bag.listing()}")
+            if topic and bag.types[topic] not in kinds:
+                raise BagError(f"topic {topic} is {bag.types[topic]}: expected {' or '.join(kinds)}")
+
+
+def _pairing(source: CameraTopics, target: CameraTopics, cameras: list[CameraTopics]) -> str:
+    if target != CameraTopics():
+        return "cameras"
+    return "keyframe" if source.image or len(cameras) == 1 else "cameras"
+
+
+def _completed(bag: Bag, given: CameraTopics, name: str, other: CameraTopics, alone: bool = False) -> CameraTopics:
+    """Fill in what was not asked for, from the guessed cameras that the other side does not use."""
+    camera = given
+    if not given.image:
+        camera = replace(_only_camera(bag, name, other, alone), **{k: v for k, v in vars(given).items() if v})
+    infos = [topic for topic, kind in bag.types.items() if kind in INFO_TYPES]
+    camera = replace(
+        camera,
+        info=camera.info or _info_of(camera.image, infos),
+        depth=camera.depth or _depth_of(camera.image, [topic for topic in _depths(bag) if topic != other.depth]),
+    )
+    if not camera.info:
+        raise BagError(f"no camera_info found for {camera.image}: give --{name}-info; topics: {bag.listing()}")
+    if not camera.depth:
+        raise BagError(
+            f"no depth found for {camera.image}: expected depth of every camera, registered to its image; "
+            f"give --{name}-depth; topics: {bag.listing()}"
+        )
+    return camera
+
+
+def _only_camera(bag: Bag, name: str, other: CameraTopics, alone: bool) -> CameraTopics:
+    free = [camera for camera in _cameras(bag) if camera.image != other.image]
+    wanted = 1 if alone or other.image else 2
+    if len(free) == wanted:
+        return free[0]
+    found = "; ".join(camera.image for camera in free) or "none"
+    raise BagError(
+        f"expected {wanted} camera(s) to choose from, found {len(free)} ({found}): give --{name}-image; "
+        f"topics: {bag.listing()}"
+    )
+
+
+def _cameras(bag: Bag) -> list[CameraTopics]:
+    """Colour cameras, one per namespace, sorted; when some have camera_info and depth, only those."""
+    infos = [topic for topic, kind in bag.types.items() if kind in INFO_TYPES]
+    depths = _depths(bag)
+    best: dict[str, str] = {}
+    for topic in sorted(set(_images(bag)) - set(depths), key=_preference):
+        best.setdefault(_stem(topic).rpartition("/")[0], topic)
+    cameras = [CameraTopics(topic, _info_of(topic, infos), "") for topic in sorted(best.values())]
+    cameras = [camera for camera in cameras if camera.info] or cameras
+    # The closest names choose first, and every depth is used once.
+    free = list(depths)
+    for camera in sorted(cameras, key=lambda c: (-max((_shared(c.image, d) for d in depths), default=0), c.image)):
+        depth = _depth_of(camera.image, free)
+        cameras[cameras.index(camera)] = replace(camera, depth=depth)
+        free = [topic for topic in free if topic != depth]
+    return [camera for camera in cameras if camera.depth] or cameras
+
+
+def _images(bag: Bag) -> list[str]:
+    return sorted(topic for topic, kind in bag.types.items() if kind in IMAGE_TYPES)
+
+
+def _depths(bag: Bag) -> list[str]:
+    return [topic for topic in _images(bag) if _is_depth(bag, topic)]
+
+
+def _is_depth(bag: Bag, topic: str) -> bool:
+    """What the first message says; the name decides for mono16, bare png and what cannot be decoded."""
+    message = bag.first(topic)
+    told = str(getattr(message, "encoding", None) or getattr(message, "format", ""))
+    if told.startswith(("16UC1", "32FC1")) or "compressedDepth" in told:
+        return True
+    return (not told or told.startswith(("mono16", "png"))) and "depth" in topic.lower()
+
+
+def _preference(topic: str) -> tuple[bool, bool, str]:
+    """Raw before compressed transport, rectified before not, then by name."""
+    return topic != _stem(topic), "rect" not in topic, topic
+
+
+def _stem(topic: str) -> str:
+    """The topic without the suffix of an image transport."""
+    head, _, tail = topic.rpartition("/")
+    return head if tail in TRANSPORTS else topic
+
+
+def _info_of(image: str, infos: Iterable[str]) -> str:
+    stem = _stem(image)
+    for candidate in (f"{stem.rpartition('/')[0]}/camera_info", f"{stem}/camera_info"):
+        if candidate in infos:
+            return candidate
+    return ""
+
+
+def _depth_of(image: str, depths: list[str]) -> str:
+    """The depth whose name shares most with the image's, those that say they are registered first; "" if none."""
+    registered = [topic for topic in depths if any(word in topic for word in REGISTERED)]
+    ranked = sorted(
+        depths, key=lambda topic: (-_shared(image, topic), topic not in registered, topic != _stem(topic), topic)
+    )
+    return ranked[0] if ranked else ""
+
+
+def _shared(a: str, b: str) -> int:
+    """How many leading parts two topic names share."""
+    parts = list(zip(a.split("/"), b.split("/"), strict=False))
+    return next((i for i, (x, y) in enumerate(parts) if x != y), len(parts))

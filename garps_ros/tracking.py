@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One camera followed against keyframes: when to take a new one, and how poses and covariances add up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from garps_core.geometry import skew, so3_log
+from garps_core.types import Float64Array, PoseEstimate, View
+
+Estimator = Callable[[View, View], PoseEstimate]
+
+
+@dataclass(frozen=True)
+class KeyframeRule:
+    """When the camera is so far from its keyframe that a new one is taken.
+
+    Args:
+        min_overlap: new keyframe when the overlap (0..1) falls below.
+        max_motion_m: new keyframe beyond this distance, m.
+        max_rotation_rad: new keyframe beyond this rotation, rad.
+        lost_after: frames in a row without a pose after which a new segment begins.
+    """
+
+    min_overlap: float = 0.5
+    max_motion_m: float = 0.3
+    max_rotation_rad: float = 0.35
+    lost_after: int = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One estimate of a view against `target`.
+
+    `T_start_source` (4x4) and `covariance` (6x6, ROS meaning) place the camera in the frame of its segment's first
+    keyframe; both are None when the estimate is not `ok`.
+    """
+
+    target: View
+    estimate: PoseEstimate
+    T_start_source: Float64Array | None = None
+    covariance: Float64Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Located:
+    """A view and the pose of its camera in the segment's first keyframe; covariance None = it is that keyframe."""
+
+    view: View
+    T: Float64Array
+    covariance: Float64Array | None
+
+
+class KeyframeTracker:
+    """Follows one camera; a view that fails against the keyframe is tried against the last good view.
+
+    Args:
+        estimate: (source, target) -> PoseEstimate of the source camera in the target camera's frame.
+        rule: when to take a new keyframe.
+    """
+
+    def __init__(self, estimate: Estimator, rule: KeyframeRule) -> None:
+        self._estimate, self._rule = estimate, rule
+        self._keyframe: _Located | None = None
+        self._last: _Located | None = None
+        self._failures = 0
+        self.segment = 0
+        """Counts from 1; poses of different segments are not related to each other."""
+        self.keyframes = 0
+
+    @property
+    def keyframe_stamp_ns(self) -> int:
+        """Stamp of the present keyframe, 0 before the first."""
+        return 0 if self._keyframe is None else self._keyframe.view.stamp_ns
+
+    def begins(self, view: View) -> bool:
+        """Make the view the origin of a new segment if one is due: at the start, or when lost for too long."""
+        if self._keyframe is not None and self._failures < self._rule.lost_after:
+            return False
+        self.segment += 1
+        self._failures = 0
+        self._last = _Located(view, np.eye(4), None)
+        self._take(self._last)
+        return True
+
+    def follow(self, view: View) -> Iterator[Attempt]:
+        """Estimate the view against the keyframe and, where that fails, against the last good view.
+
+        Raises what the estimator raises; the view then counts as one without a pose.
+        """
+        self._failures += 1
+        for reference in self._references():
+            estimate = self._estimate(view, reference.view)
+            if not estimate.ok or estimate.T_target_source is None or estimate.covariance is None:
+                yield Attempt(reference.view, estimate)
+                continue
+            self._failures = 0
+            relative = estimate.T_target_source
+            covariance = composed_covariance(reference.T, reference.covariance, relative, estimate.covariance)
+            self._last = _Located(view, reference.T @ relative, covariance)
+            if self._is_far(relative, estimate.overlap):
+                self._take(self._last)
+            elif reference is not self._keyframe:
+                self._take(reference)
+            yield Attempt(reference.view, estimate, self._last.T, covariance)
+            return
+
+    def _take(self, located: _Located) -> None:
+        self._keyframe = located
+        self.keyframes += 1
+
+    def _references(self) -> list[_Located]:
+        candidates = [self._keyframe] if self._keyframe is self._last else [self._keyframe, self._last]
+        return [located for located in candidates if located is not None]
+
+    def _is_far(self, T: Float64Array, overlap: float) -> bool:
+        return (
+            overlap < self._rule.min_overlap
+            or float(np.linalg.norm(T[:3, 3])) > self._rule.max_motion_m
+            or float(np.linalg.norm(so3_log(T[:3, :3]))) > self._rule.max_rotation_rad
+        )
+
+
+def composed_covariance(
+    T_ab: Float64Array, covariance_ab: Float64Array | None, T_bc: Float64Array, covariance_bc: Float64Array
+) -> Float64Array:
+    """6x6 covariance of T_ab @ T_bc in the ROS meaning, for independent errors; covariance_ab None = T_ab exact.
+
+    With p_ac = R_ab p_bc + p_ab, a small rotation w of T_ab moves p_ac by w x (R_ab p_bc).
+    """
+    R = np.kron(np.eye(2), T_ab[:3, :3])
+    total = R @ covariance_bc @ R.T
+    if covariance_ab is not None:
+        J = np.eye(6)
+        J[:3, 3:] = -skew(T_ab[:3, :3] @ T_bc[:3, 3])
+        total = total + J @ covariance_ab @ J.T
+    return np.asarray(0.5 * (total + total.T))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages -> the core's View: decode, decide on the calibration, undistort. Used offline and live."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from garps_core.types import View
+from msg_adapters import camera_from_info, depth_image, header_frame_id, header_stamp_ns, rgb_image
+
+
+def view_from_messages(
+    image: Any,
+    info: Any,
+    depth: Any = None,
+    *,
+    topic: str = "",
+    rectified: str = "auto",
+    allow_resized: bool = False,
+) -> tuple[View, str]:
+    """Make a View of an Image or CompressedImage, its CameraInfo and the depth registered to it.
+
+    Args:
+        image: sensor_msgs/Image or CompressedImage in colour or grey.
+        info: sensor_msgs/CameraInfo of the image.
+        depth: sensor_msgs/Image or CompressedImage, of the same size and lens as the image; None = no depth.
+        topic: the image's topic, from which "auto" reads whether the image is rectified.
+        rectified: "auto", "true" or "false", see `camera_from_info`.
+        allow_resized: accept an image that was scaled evenly against its CameraInfo.
+    Returns:
+        The view without distortion, stamp and frame those of the image; and a text that says which calibration was
+        used and why, to be logged when it changes.
+    Raises:
+        MessageError: a message that is malformed, or does not fit the others.
+        InputError: what is left is no view the core can use.
+    """
+    rgb = rgb_image(image)
+    camera = camera_from_info(
+        info, (rgb.shape[1], rgb.shape[0]), topic=topic, rectified=rectified, allow_resized=allow_resized
+    )
+    metres = None if depth is None else depth_image(depth)
+    rgb, metres = camera.rectify(rgb, metres)
+    frame_id, decision = header_frame_id(image), camera.decision
+    if depth is not None and header_frame_id(depth) != frame_id:
+        decision += f"; depth is of frame {header_frame_id(depth)!r}, not {frame_id!r}: is it registered to the image?"
+    return View(rgb=rgb, K=camera.K, depth=metres, stamp_ns=header_stamp_ns(image), frame_id=frame_id), decision
