@@ -99,7 +99,7 @@ def wood(rng: np.random.Generator, shape: tuple[int, int], texel_m: float, colou
         cx, cy = rng.uniform(0, width), rng.uniform(0, height)
         r2 = ((u - cx) * texel_m / 0.05) ** 2 + ((v - cy) * texel_m / 0.018) ** 2
         phase = phase + 7 * np.exp(-r2)
-        pores = pores - 1.2 * np.exp(-2.5 * r2)
+        pores -= (1.2 * np.exp(-2.5 * r2)).astype(np.float32)
     rings = np.sin(phase + 0.6 * np.sin(2 * phase))
     return tint(colour, ((0.045 + 0.03 * bend) * rings + 0.15 * pores + 0.06 * bend).astype(np.float32), 0.02 * bend)
 

@@ -16,6 +16,7 @@ from bench.rooms.layout import make_room
 from bench.rooms.mesh import LABELS, Array
 from bench.rooms.render import Float32Array, Room
 from bench.rooms.shading import camera_rays
+from garps_core.geometry import se3_inverse
 
 #: level: (rotation deg, translation m, lowest and highest wanted overlap)
 LEVELS: dict[int, tuple[float, float, float, float]] = {
@@ -94,7 +95,7 @@ def make_pair(
         noise = np.random.default_rng([seed, level, 202, k])
         exposure = float(noise.uniform(0.85, 1.2))
         views.append(room.render(poses[k], Ks[k], width, height, exposure, rng=noise))
-    T_1_0 = np.linalg.inv(poses[1]) @ poses[0]
+    T_1_0 = se3_inverse(poses[1]) @ poses[0]
     true = [view.depth_m for view in views]
     return RoomPair(
         views[0].rgb, views[1].rgb,
@@ -117,7 +118,7 @@ def mutual_overlap(
 ) -> float:
     """Share of pixels whose surface the other camera sees, the smaller of both directions; HxW m depths."""
     forward = visible_share(depth0, depth1, K0, K1, T_1_0, stride)
-    return min(forward, visible_share(depth1, depth0, K1, K0, np.linalg.inv(T_1_0), stride))
+    return min(forward, visible_share(depth1, depth0, K1, K0, se3_inverse(T_1_0), stride))
 
 
 def visible_share(
@@ -195,7 +196,7 @@ def _place_cameras(room: Room, rng: np.random.Generator, level: int, shapes: lis
                 continue
             second = _Look(room, T, shapes[1])
             low, high = LEVELS[level][2:]
-            overlap = mutual_overlap(first.depth, second.depth, first.K, second.K, np.linalg.inv(T) @ first.T, 1)
+            overlap = mutual_overlap(first.depth, second.depth, first.K, second.K, se3_inverse(T) @ first.T, 1)
             miss = max(low - overlap, overlap - high, 0.0) + max(1 - second.quality(), 0.0)
             miss += max(1 - first.quality(), 0.0)
             if best is None or miss < best[0]:

@@ -177,7 +177,7 @@ def parcel(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> 
     image = tx.tint(tx.pick(rng, ((0.68, 0.52, 0.35),)), 0.04 * ribs + 0.07 * tx.noise(rng, shape, (30, 30), 5, 0.7))
     image = np.ascontiguousarray(image)
     tape = int(rng.uniform(0.3, 0.6) * width)
-    image[:, tape : tape + int(0.05 / texel_m)] *= np.float32([1.12, 1.05, 0.85])
+    image[:, tape : tape + int(0.05 / texel_m)] *= np.array([1.12, 1.05, 0.85], np.float32)
     x, y = int(rng.uniform(0.05, 0.45) * width), int(rng.uniform(0.1, 0.5) * height)
     w, h = int(0.4 * width), int(0.33 * height)
     cv2.rectangle(image, (x, y), (x + w, y + h), (0.92, 0.92, 0.9), -1)

@@ -37,7 +37,7 @@ class Rendering:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where N rays ended. `face` is -1 for a miss; the other values are then meaningless."""
+    """Where N rays ended. `face` is -1 for a miss; t is then 0, u and v are meaningless."""
 
     face: npt.NDArray[np.int64]
     t: Float32Array
@@ -83,7 +83,9 @@ class Room:
         d = np.ascontiguousarray(directions, np.float32)
         o = np.ascontiguousarray(np.broadcast_to(np.asarray(origins, np.float32), d.shape))
         hit = self._scene.run(o, d, query="INTERSECT", output=True)
-        return Hits(hit["primID"].astype(np.int64), hit["tfar"], hit["u"], hit["v"])
+        face = hit["primID"].astype(np.int64)
+        # A finite t for misses keeps infinities out of the rays that start at the hits.
+        return Hits(face, np.where(face < 0, np.float32(0), hit["tfar"]), hit["u"], hit["v"])
 
     def blocked(self, origins: Float32Array, directions: Float32Array) -> npt.NDArray[np.bool_]:
         """Whether anything is hit within one length of each of N directions."""
