@@ -54,7 +54,9 @@ def load_pairs() -> list[StereoPair]:
     """The twelve pairs, by name. Raises FileNotFoundError when stereodemo is not installed."""
     spec = importlib.util.find_spec("stereodemo")
     if spec is None or not spec.submodule_search_locations:
-        raise FileNotFoundError("stereodemo is not installed: expected `make demo`, or pip install --no-deps stereodemo")
+        raise FileNotFoundError(
+            "stereodemo is not installed: expected `make demo`, or pip install --no-deps stereodemo"
+        )
     folder = Path(spec.submodule_search_locations[0]) / "datasets" / "oak-d"
     calibration = json.loads((folder / "stereodemo_calibration.json").read_text())
     K = np.array(
@@ -67,7 +69,11 @@ def load_pairs() -> list[StereoPair]:
     names = sorted(path.name.removesuffix("_left.png") for path in folder.glob("*_left.png"))
     return [
         StereoPair(
-            name, _rgb(folder / f"{name}_left.png"), _rgb(folder / f"{name}_right.png"), K, calibration["baseline_meters"]
+            name,
+            _rgb(folder / f"{name}_left.png"),
+            _rgb(folder / f"{name}_right.png"),
+            K,
+            calibration["baseline_meters"],
         )
         for name in names
     ]
