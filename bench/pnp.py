@@ -16,7 +16,7 @@ from garps_core.types import Float64Array, View
 FEATURES = 4000
 MATCH_RATIO = 0.8
 RANSAC_PX = 3.0
-MIN_INLIERS = 12
+MIN_INLIERS = 8
 MAX_RELIEF = 0.03
 """Share of depth by which a keypoint's 5x5 surroundings may vary: on silhouettes the reading is foreground or
 background by chance."""

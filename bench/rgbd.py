@@ -22,7 +22,7 @@ from rich.progress import track
 from bench.baselines import METHODS, NEED_NO_START
 from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, with_monocular_depth
 from bench.tables import Row, machine_facts, print_tables, summarise, write
-from garps_core import Config, PoseEstimate, Prior, estimate_relative_pose, metrics
+from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.types import Float64Array
 
 GARPS, START = "garps", "(start)"
@@ -88,7 +88,10 @@ def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tu
     method = {"features": "features", "identity": "identity", "disturbed": "auto"}[start]
     config = config.replace({"start.method": method})
     began = time.perf_counter()
-    estimate = estimate_relative_pose(pair.source, pair.target, config, prior)
+    try:
+        estimate = estimate_relative_pose(pair.source, pair.target, config, prior)
+    except GarpsError as error:  # an answer about this pair, not about the others
+        estimate = PoseEstimate(Status.NO_INITIAL_POSE, f"{type(error).__name__}: {error}", initial=prior)
     return estimate, time.perf_counter() - began
 
 
