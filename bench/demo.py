@@ -35,7 +35,7 @@ from garps_ros.replay import main as replay
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""
-PICTURE = "living_room"
+PICTURE = "bedroom_chair"
 ROOM_SEED, ROOM_LEVEL = 3, 4
 
 Array = npt.NDArray[np.float64]
@@ -57,6 +57,11 @@ def main(
 ) -> int:
     """Run both parts; exit code 0 when the median baseline error is below the limit."""
     begin = time.perf_counter()
+    try:
+        load_pairs()
+    except FileNotFoundError as error:
+        console.print(f"demo: error: {error}", style="red", soft_wrap=True)
+        return 2
     out.mkdir(parents=True, exist_ok=True)
     good = stereo_part(out, scenes)
     room_part(out)
