@@ -31,7 +31,8 @@ test: $(VENV)/.test
 	$(PY) -m pytest --cov --cov-report=term
 
 bench: $(VENV)/.test
-	$(PY) -m bench.run
+	$(PY) -m bench.speed
+	$(PY) -m bench.rgbd
 
 test-numpy1: $(VENV1)/.test
 	$(PY1) -m pytest
