@@ -12,6 +12,7 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from garps_ros.truncated import salvageable
 from msg_adapters import MessageError
 
 
@@ -42,18 +43,31 @@ class Bag:
         if not self.path.exists():
             raise BagError(f"{self.path} does not exist: expected a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file")
         try:
-            # Older rosbag2 files carry no message definitions; the ones that matter here never changed.
-            store = get_typestore(Stores.ROS2_JAZZY)
-            self._reader = self._stack.enter_context(AnyReader([self.path], default_typestore=store))
-            topics = self._reader.topics
-        except Exception as error:  # a damaged file makes the reader and its decoders raise nearly anything
-            raise BagError(f"{self.path} cannot be read as a recording: {_one_line(error)}{self._hint()}") from None
+            self._open(self.path)
+        except BagError as error:
+            rest = salvageable(self.path)
+            if rest is None:
+                raise
+            try:
+                self._open(rest)
+            except BagError:
+                raise error from None
+            self.broken_end = "" if isinstance(rest, Path) else "the end of the file is missing"
+        topics = self._reader.topics
         self.counts = {name: info.msgcount for name, info in topics.items() if info.msgcount}
         self.types = {name: topics[name].msgtype or "several types" for name in self.counts}
         if not self.types:
             self._stack.close()
             raise BagError(f"{self.path} holds no messages: expected images, camera_info and depth")
         return self
+
+    def _open(self, path: Any) -> None:
+        try:
+            # Older rosbag2 files carry no message definitions; the ones that matter here never changed.
+            reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+            self._reader = self._stack.enter_context(reader)
+        except Exception as error:  # a damaged file makes the reader and its decoders raise nearly anything
+            raise BagError(f"{self.path} cannot be read as a recording: {_one_line(error)}{self._hint()}") from None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

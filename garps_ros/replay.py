@@ -53,6 +53,8 @@ def main(arguments: list[str] | None = None) -> int:
         message = error.format_message()  # type: ignore[attr-defined]
         if not message:  # no arguments: the help has been printed
             return 2
+    except OSError as error:  # a full disk, a folder that went away; the results so far have been closed
+        message = f"cannot go on: {error}"
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
     print(f"{NAME}: error: {' '.join(message.split())}", file=sys.stderr)

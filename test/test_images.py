@@ -269,6 +269,7 @@ MALFORMED_COLOUR = {
     "png bit flipped": (compressed(damaged(PNG8, len(PNG8) // 2), "png"), "data cannot be decoded"),
     "png huge": (compressed(png_of_size(2**31 - 1, 2**31 - 1), "png"), "compressed image is 2147483647x2147483647"),
     "png wide": (compressed(png_of_size(8193, 1), "png"), "compressed image is 8193x1"),
+    "png tall": (compressed(png_of_size(1, 8193), "png"), "compressed image is 1x8193"),
     "png empty": (compressed(png_of_size(0, 5), "png"), "compressed image is 0x5"),
     "depth png as colour": (compressed(PNG16, "png"), "16 bit grey .*looks like depth"),
     "declared depth as colour": (compressed(PNG16, "16UC1; png compressed"), "this is depth"),

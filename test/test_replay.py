@@ -237,21 +237,63 @@ def test_malformed_messages_are_counted_and_passed_over(tmp_path, capfd, storage
     assert "message cannot be decoded" in shown
 
 
+PAGE, TABLE = 4096, {2, 5, 10, 13}  # of sqlite: size of a page, first byte of those that are no message contents
+
+
+def storage_file(bag):
+    return bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix != ".yaml")
+
+
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_recording_that_breaks_off_keeps_what_was_read_or_says_so(tmp_path, capfd, storage):
-    """ROS 1 and MCAP keep their index at the end and cannot be opened without it; sqlite gives what is left."""
+def test_damage_in_the_middle_keeps_what_was_read(tmp_path, capfd, storage):
+    bag = write(tmp_path, storage, frames(["/cam"], 150, library_of(storage)))
+    data = bytearray(storage_file(bag).read_bytes())
+    middle, length = len(data) // 2 // PAGE * PAGE, 200_000
+    if storage == "sqlite3":  # two pages of one message; a damaged table page would be noticed on opening
+        length = 2 * PAGE
+        middle = next(at for at in range(middle, len(data), PAGE) if not TABLE & {data[at], data[at + PAGE]})
+    data[middle : middle + length] = b"\xaa" * length
+    storage_file(bag).write_bytes(data)
+    assert run(bag, tmp_path / "out") == 0
+    assert "recording breaks off" in capfd.readouterr().out
+    path = trajectory(tmp_path / "out")
+    assert 20 < len(path) < 140
+    np.testing.assert_allclose(path[:, 1], np.arange(len(path)) * 0.1, atol=1e-9)
+    assert len(published(tmp_path / "out")) == 2 * (len(path) - 1)
+
+
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("share", [0.7, 0.995, 1 - 1e-6])
+def test_an_mcap_file_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, capfd, metadata, share):
+    """A recorder that loses power leaves no index, no footer and no metadata.yaml."""
+    bag = write(tmp_path, "mcap", frames(["/cam"], 150, "rosbags"))
+    whole = storage_file(bag).read_bytes()
+    storage_file(bag).write_bytes(whole[: int(len(whole) * share)])
+    if not metadata:
+        (bag / "metadata.yaml").unlink()
+    assert run(bag, tmp_path / "out") == 0
+    assert "recording breaks off │ the end of the file is missing" in " ".join(capfd.readouterr().out.split())
+    assert len(trajectory(tmp_path / "out")) >= 60
+    assert run(storage_file(bag), tmp_path / "again") == 0
+    assert (tmp_path / "again" / "poses.csv").read_bytes() == (tmp_path / "out" / "poses.csv").read_bytes()
+
+
+def test_a_whole_mcap_file_needs_no_metadata(tmp_path, capfd):
+    bag = write(tmp_path, "mcap", frames(["/cam"], 3, "rosbags"))
+    (bag / "metadata.yaml").unlink()
+    assert run(bag, tmp_path / "out") == 0 and len(trajectory(tmp_path / "out")) == 3
+    assert "breaks off" not in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "ros1"])
+def test_files_that_need_their_end_are_refused_with_advice(tmp_path, capfd, storage):
     bag = write(tmp_path, storage, frames(["/cam"], 12, library_of(storage)))
-    file = bag if storage == "ros1" else next(path for path in bag.iterdir() if path.suffix != ".yaml")
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) * 2 // 3])
-    code = run(bag, tmp_path / "out")
-    shown = capfd.readouterr()
-    if code == 2:
-        assert shown.err.count("\n") == 1 and "cannot be read as a recording" in shown.err and "reindex" in shown.err
-        assert not (tmp_path / "out").exists()
-    else:
-        assert code == 0 and "recording breaks off" in shown.out
-        assert 2 <= len(trajectory(tmp_path / "out")) < 12
+    whole = storage_file(bag).read_bytes()
+    storage_file(bag).write_bytes(whole[: len(whole) * 2 // 3])
+    assert run(bag, tmp_path / "out") == 2
+    shown = capfd.readouterr().err
+    assert shown.count("\n") == 1 and "cannot be read as a recording" in shown and "reindex" in shown
+    assert not (tmp_path / "out").exists()
 
 
 def test_results_are_not_overwritten_by_accident(tmp_path, capfd):

@@ -27,14 +27,21 @@ def garbage(name):
     return make
 
 
-def cut_metadata(folder):
+def cut_at_once(folder):
     bag = single_camera(folder)
+    file = bag / "walk.mcap"
+    file.write_bytes(file.read_bytes()[:100])
+    return file
+
+
+def cut_metadata(folder):
+    bag = write(folder, "sqlite3", frames(["/cam"], 2, "rosbags"))
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
     return bag
 
 
 def no_metadata(folder):
-    bag = single_camera(folder)
+    bag = write(folder, "sqlite3", frames(["/cam"], 2, "rosbags"))
     (bag / "metadata.yaml").unlink()
     return bag
 
@@ -48,6 +55,7 @@ MISTAKES = {
     "corrupt ros1": (garbage("a.bag"), [], "cannot be read as a recording"),
     "corrupt mcap": (garbage("a.mcap"), [], "cannot be read as a recording"),
     "corrupt sqlite": (garbage("a.db3"), [], "cannot be read as a recording"),
+    "mcap cut at once": (cut_at_once, [], "cannot be read as a recording|holds no messages"),
     "another file": (garbage("a.txt"), [], "cannot be read as a recording"),
     "empty file": (lambda folder: (folder / "a.bag").touch() or folder / "a.bag", [], "cannot be read"),
     "corrupt metadata": (cut_metadata, [], "cannot be read as a recording"),
