@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from garps_core.errors import GarpsError, InputError
+from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import Float64Array, PoseEstimate, View
 from garps_ros.frames import Frame, Frames
 from garps_ros.outputs import Row
@@ -15,7 +15,12 @@ from garps_ros.tracking import Estimator, KeyframeTracker
 from garps_ros.views import view_from_messages
 from msg_adapters import MessageError, header_frame_id
 
-MALFORMED, INVALID, NO_MIXTURE = "malformed_message", "invalid_input", "no_reconstruction"
+FAILURES: dict[type[Exception], str] = {
+    MessageError: "malformed_message",
+    InputError: "invalid_input",
+    ReconstructionError: "no_reconstruction",
+}
+OTHER_FAILURE = "core_error"
 
 
 @dataclass(frozen=True)
@@ -132,5 +137,5 @@ def _row(stamps: tuple[int, int], names: tuple[str, str], segment: int, found: P
 
 
 def _failed(stamps: tuple[int, int], names: tuple[str, str], segment: int, error: Exception) -> Row:
-    kind = MALFORMED if isinstance(error, MessageError) else INVALID if isinstance(error, InputError) else NO_MIXTURE
+    kind = next((name for kind, name in FAILURES.items() if isinstance(error, kind)), OTHER_FAILURE)
     return Row(*stamps, *names, kind, str(error), segment=segment)
