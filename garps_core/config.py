@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from garps_core.errors import ConfigError
 
 
@@ -55,11 +58,13 @@ class Lifting(_Checked):
     """How a pixel with depth becomes a Gaussian (`reconstruct`)."""
 
     stride: int = setting(2, "use every n-th pixel in both image directions", unit="px", low=1, high=32)
-    noise_floor_m: float = setting(1e-3, "depth noise sigma at zero range", unit="m", low=0, high=1)
-    noise_linear: float = setting(2e-3, "depth noise sigma per metre of range", unit="m/m", low=0, high=1)
+    noise_floor_m: float = setting(5e-4, "depth noise sigma at zero range", unit="m", low=0, high=1)
+    noise_linear: float = setting(1e-3, "depth noise sigma per metre of range", unit="m/m", low=0, high=1)
     noise_quadratic_per_m: float = setting(
         0.0, "depth noise sigma per square metre of range (triangulating sensors)", unit="1/m", low=0, high=0.1
     )
+    scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
+    warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
     edge_ratio: float = setting(
         0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
     )
@@ -73,6 +78,11 @@ class Lifting(_Checked):
     weighting: str = setting(
         "area", "component weights: surface area seen, or one per pixel", choices=("area", "equal")
     )
+
+
+    def mode_sigmas(self) -> npt.NDArray[np.float64]:
+        """Sigmas (6,) of the depth modes of `systematic.py`: scale, then five of warp."""
+        return np.array([self.scale_sigma] + [self.warp_sigma] * 5)
 
 
 @dataclass(frozen=True)
@@ -116,24 +126,31 @@ class Alignment(_Checked):
         choices=("second_order", "adam"),
     )
     ladder: tuple[Rung, ...] = (
-        Rung(30.0, 2000, 12, 6),
-        Rung(10.0, 3000, 10, 6),
-        Rung(3.0, 4000, 10, 6),
-        Rung(1.0, 6000, 10, 6),
+        Rung(100.0, 1500, 20, 8),
+        Rung(30.0, 2000, 15, 8),
+        Rung(10.0, 3000, 12, 8),
+        Rung(4.0, 4000, 12, 8),
+        Rung(2.0, 8000, 12, 8),
     )
-    colour_variance: float = setting(0.05, "variance of each colour channel (0..1)", unit="", low=1e-4, high=100)
+    colour_variance: float = setting(0.02, "variance of each colour channel (0..1)", unit="", low=1e-4, high=100)
     semantic_discount: float = setting(0.92, "weight of a pair with different labels", unit="", low=0, high=1)
     outlier_floor: float = setting(
-        0.01, "outlier density, in densities of one perfect partner", unit="", low=0, high=10
+        0.003, "outlier density, in densities of one perfect partner", unit="", low=0, high=10
+    )
+    depth_weight: float = setting(
+        1.0,
+        "1 = nearest in space; below 1 = nearest in the other camera's image, with the logarithm of depth times this",
+        low=1e-3,
+        high=1,
     )
     max_distance_m: float = setting(2.5, "partners further apart are ignored", unit="m", low=1e-3, high=1000)
     occlusion_ratio: float = setting(
         0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
     )
     information: float = setting(
-        150.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
+        10.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
     )
-    tolerance: float = setting(1e-4, "a step smaller than this share of its sigma is converged", low=1e-9, high=1)
+    tolerance: float = setting(0.02, "a step shorter than this many of its own sigmas is converged", low=1e-9, high=1)
     min_overlap: float = setting(0.1, "smaller overlap is refused", unit="", low=0, high=1)
     opacity_threshold: float = setting(0.0, "drop components of smaller weight", low=0, high=1)
     adam_rate_translation: float = setting(9e-5, "Adam's rate for the translation", unit="m", low=0, high=1)
@@ -194,8 +211,12 @@ def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
 def _monocular() -> Config:
     """Metric depth from one image: right to a few per cent in scale and shape, so long along each ray."""
     return Config(
-        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, smoothing_px=0),
-        alignment=Alignment(colour_variance=0.02),
+        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, smoothing_px=0, scale_sigma=0.03, warp_sigma=0.02),
+        alignment=Alignment(
+            ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 8)),
+            colour_variance=0.01,
+            depth_weight=0.2,
+        ),
     )
 
 

@@ -16,3 +16,7 @@ class ConfigError(GarpsError, ValueError):
 
 class ReconstructionError(GarpsError):
     """A view that is well formed but holds too little depth to become a mixture."""
+
+
+class InitialisationError(GarpsError):
+    """No initial pose: too few feature matches fit one pose and no other start is allowed."""

@@ -32,6 +32,8 @@ from garps_core.geometry import Array
 CHUNK_PAIRS = 1 << 15
 """Pairs handled at a time: sixteen float32 planes of this size stay in a CPU core's second-level cache."""
 CHUNK_PAIRS_CUDA = 1 << 22
+NOTHING = -60.0
+"""Logarithm of a density, relative to the floor, that is as good as none; smaller ones become slow subnormals."""
 SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Order of the six distinct elements of a symmetric 3x3 matrix."""
 _FULL = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5])
@@ -123,7 +125,8 @@ def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
     u1 = p1 * d0 + p3 * d1 + p4 * d2
     u2 = p2 * d0 + p4 * d1 + p5 * d2
     D = d0.mul_(u0).add_(d1.mul_(u1)).add_(d2.mul_(u2))
-    g = (pairs.log_weights[:, rows] - pairs.log_floor[rows] - 0.5 * (D + torch.log(det))).exp_()
+    log_g = pairs.log_weights[:, rows] - pairs.log_floor[rows] - D.add_(det.log_()).mul_(0.5)
+    g = log_g.clamp_(min=NOTHING).exp_()
     g0, g1, g2 = g * u0, g * u1, g * u2
     planes = (
         g, g0, g1, g2,

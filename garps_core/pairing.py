@@ -85,7 +85,7 @@ def overlap(source: Cloud, target: Cloud, T: Array, settings: Alignment) -> floa
 
 def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignment) -> Pairs:
     """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances scaled by the rung."""
-    index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)))
+    index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)), settings.depth_weight)
     chosen = index.T.contiguous()  # (k, n)
     log_weights = torch.log(partners.weights.clamp_min(1e-30))[chosen]
     log_weights = log_weights - _colour_cost(rows, partners, chosen, settings.colour_variance)
@@ -106,19 +106,28 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
     )
 
 
-def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int) -> tuple[Tensor, Tensor]:
+def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
     """Indices and distances (n, k) of the nearest partners by Euclidean distance of the means."""
     like = rows.means
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
     moved = like @ R.T + t
+    them = partners.means
+    if depth_weight < 1:
+        moved, them = _image_coordinates(moved, depth_weight), _image_coordinates(them, depth_weight)
     if like.is_cuda:
-        found = [torch.cdist(block, partners.means).topk(k, largest=False) for block in moved.split(4096)]
+        found = [torch.cdist(block, them).topk(k, largest=False) for block in moved.split(4096)]
         return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
-    distance, index = cKDTree(partners.means.numpy(), balanced_tree=False, compact_nodes=False).query(
+    distance, index = cKDTree(them.numpy(), balanced_tree=False, compact_nodes=False).query(
         moved.numpy(), k=k, workers=-1
     )
     shape = (len(rows), k)
     return torch.from_numpy(index.reshape(shape)), torch.from_numpy(distance.reshape(shape)).to(like.dtype)
+
+
+def _image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
+    """(n, 3) m -> (x/z, y/z, depth_weight log z): a partner along the same ray is near although its depth is off."""
+    z = points[:, 2:].clamp_min(1e-3)
+    return torch.cat([points[:, :2] / z, depth_weight * torch.log(z)], dim=1)
 
 
 def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:

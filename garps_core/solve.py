@@ -20,6 +20,10 @@ from garps_core.objective import Evaluation, Pairs, evaluate
 from garps_core.pairing import Cloud, pair_up, thin, visible
 
 MIN_ROWS = 50
+SMALLEST_CURVATURE = 0.1
+"""Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
+ENTRY_WIDTH = 2.0
+"""A rung is skipped when the next one's kernels are still this many times wider than the start's uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,10 @@ class Solution:
     posterior: Posterior
     iterations: int
     converged: bool
+    pairs: tuple[Pairs, Pairs]
+    """Source rows to target partners, and target rows to source partners, of the last rung."""
+    weight: float
+    """What the data term was multiplied with: effective number of independent measurements of the last rung."""
 
 
 def two_way(forward: Pairs, backward: Pairs, T: Array) -> Evaluation:
@@ -57,12 +65,28 @@ def two_way(forward: Pairs, backward: Pairs, T: Array) -> Evaluation:
 
 
 def inverse_left_jacobian(twist: Array) -> Array:
-    """6x6 d log(exp(x) exp(twist)) / dx at x = 0, to fourth order in the twist (Sola eq. 179 ff.)."""
+    """6x6 d log(exp(x) exp(twist)) / dx at x = 0, to sixth order in the twist (Bernoulli series)."""
     ad = np.zeros((6, 6))
     ad[:3, :3] = ad[3:, 3:] = skew(twist[3:])
     ad[:3, 3:] = skew(twist[:3])
     square = ad @ ad
-    return np.asarray(np.eye(6) - 0.5 * ad + square / 12 - square @ square / 720)
+    fourth = square @ square
+    return np.asarray(np.eye(6) - 0.5 * ad + square / 12 - fourth / 720 + fourth @ square / 30240)
+
+
+def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE) -> Array:
+    """Observed information, kept between `smallest` and 1 times the Gauss-Newton information per direction.
+
+    Gauss-Newton holds the assignment of partners fixed and so takes steps that are too short (expectation
+    maximisation); the observed information knows that partners change, but may be indefinite far from the optimum.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(data.information), 1e-12))
+    full = data.information * np.outer(scale, scale) + 1e-9 * np.eye(6)
+    L = np.linalg.cholesky(full)
+    inner = np.linalg.solve(L, np.linalg.solve(L, data.observed * np.outer(scale, scale)).T)
+    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
+    half = L @ (vectors * np.sqrt(np.clip(values, smallest, 1.0)))
+    return np.asarray((half @ half.T) / np.outer(scale, scale))
 
 
 def posterior(data: Evaluation, T: Array, T_prior: Array, precision: Array, weight: float) -> Posterior:
@@ -72,34 +96,41 @@ def posterior(data: Evaluation, T: Array, T_prior: Array, precision: Array, weig
     return Posterior(
         weight * data.value - 0.5 * float(r @ precision @ r),
         weight * data.gradient - J.T @ precision @ r,
-        weight * data.information + J.T @ precision @ J,
+        weight * curvature(data) + J.T @ precision @ J,
         data,
     )
 
 
-def climb(function: Callable[[Array], Posterior], T: Array, steps: int, tolerance: float) -> Solution:
+@dataclass(frozen=True)
+class Climb:
+    """Where one rung ended."""
+
+    T: Array
+    posterior: Posterior
+    iterations: int
+    converged: bool
+
+
+def climb(function: Callable[[Array], Posterior], T: Array, steps: int, tolerance: float) -> Climb:
     """Levenberg-damped ascent: at most `steps` evaluations beyond the first, never downhill.
 
     Stops when a step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
     """
     here = function(T)
-    damping, converged, used = 1e-3, False, 0
-    while used < steps and not converged:
+    damping, used = 1e-3, 0
+    while used < steps:
         H = here.information
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(6), here.gradient)
-        size = float(np.sqrt(max(step @ H @ step, 0.0)))
-        if size < tolerance:
-            return Solution(T, here, used, True)
+        if float(np.sqrt(max(step @ H @ step, 0.0))) < tolerance:
+            return Climb(T, here, used, True)
         there_T = se3_exp(step) @ T
         there = function(there_T)
         used += 1
         if there.value >= here.value:
-            converged = size < tolerance * 10
             T, here, damping = there_T, there, max(damping * 0.2, 1e-6)
         else:
             damping = max(damping, 1e-3) * 10
-            converged = damping > 1e8
-    return Solution(T, here, used, converged)
+    return Climb(T, here, used, False)
 
 
 def rung_pairs(source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment) -> tuple[Pairs, Pairs] | None:
@@ -113,23 +144,42 @@ def rung_pairs(source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Ali
     return pair_up(x_seen, y_seen, T, rung, settings), pair_up(y_seen, x_seen, back, rung, settings)
 
 
-def anneal(
-    source: Cloud, target: Cloud, T_prior: Array, precision: Array, ladder: tuple[Rung, ...], settings: Alignment
-) -> Solution | None:
-    """Run the ladder from the prior's pose; None when a rung finds too few visible components."""
+def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:
+    """Index of the first rung worth running: a precise start needs no wide kernels.
+
+    covariance is the start's, over the left twist. Its effect on the source points is compared with the rungs' widths.
+    """
+    points = thin(source, 200).means.double().cpu().numpy() @ T[:3, :3].T + T[:3, 3]
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -np.stack([skew(p) for p in points])], axis=2)
+    uncertainty = np.sqrt(np.median(np.einsum("nij,jk,nik->n", J, covariance, J)) / 3)
+    spread = source.covariances.double()
+    width = np.sqrt(float((spread[:, 0] + spread[:, 3] + spread[:, 5]).median()) / 3)
+    first = 0
+    while first + 1 < len(ladder) and np.sqrt(ladder[first + 1].covariance_scale) * width > ENTRY_WIDTH * uncertainty:
+        first += 1
+    return first
+
+
+def anneal(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, settings: Alignment) -> Solution | None:
+    """Run the ladder from the prior's pose; None when a rung finds too few visible components.
+
+    Args:
+        source, target: mixtures on the device.
+        T_prior: 4x4 start. covariance: its 6x6, left twist.
+    """
+    precision = np.linalg.inv(covariance)
     T, used = T_prior, 0
     solution: Solution | None = None
-    for rung in ladder:
+    for rung in settings.ladder[entry(source, T_prior, covariance, settings.ladder) :]:
         pairs = rung_pairs(source, target, T, rung, settings)
         if pairs is None:
             return None
-        forward, backward = pairs
+        weight = settings.information * rung.covariance_scale  # wider kernels anneal, they do not measure less
 
-        def function(pose: Array, forward: Pairs = forward, backward: Pairs = backward) -> Posterior:
-            data = two_way(forward, backward, pose)
-            return posterior(data, pose, T_prior, precision, settings.information)
+        def function(pose: Array, pairs: tuple[Pairs, Pairs] = pairs, weight: float = weight) -> Posterior:
+            return posterior(two_way(*pairs, pose), pose, T_prior, precision, weight)
 
-        solution = climb(function, T, rung.steps, settings.tolerance)
-        T, used = solution.T, used + solution.iterations
-    assert solution is not None
-    return Solution(T, solution.posterior, used, solution.converged)
+        end = climb(function, T, rung.steps, settings.tolerance)
+        T, used = end.T, used + end.iterations
+        solution = Solution(T, end.posterior, used, end.converged, pairs, weight)
+    return solution

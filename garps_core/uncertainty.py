@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances: between the solver's left twist and the ROS meaning, and from curvature to an honest 6x6.
+"""Covariances: from curvature and shared depth errors to an honest 6x6, and between conventions.
 
 A left twist (v, w) perturbs T to exp(v, w) T: the position t becomes t + v + w x t. ROS (REP 103) wants the
 covariance of the position itself and of small rotations about the fixed axes: (dt, w) with dt = v - [t]x w.
@@ -7,9 +7,20 @@ covariance of the position itself and of small rotations about the fixed axes: (
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from garps_core.geometry import Array, adjoint, skew
+import numpy as np
+import torch
+
+from garps_core.geometry import Array, adjoint, se3_inverse, skew
+from garps_core.objective import Pairs
+from garps_core.solve import Solution, curvature, two_way
+from garps_core.systematic import MODES, depth_modes
+
+RELATIVE_STEP = 1e-3
+"""Relative depth change by which the effect of a shared depth error is probed."""
+OPEN_DIRECTION = 1e-3
+"""Directions in which re-assigning partners cancels the curvature keep this share of it: a very large variance."""
 
 
 def _position_from_twist(t: Array) -> Array:
@@ -32,6 +43,59 @@ def twist_from_ros(covariance: Array, T: Array) -> Array:
 
 def inverted(covariance: Array, T: Array) -> Array:
     """Covariance (ROS meaning) of T^-1, given that of T: what swapping source and target does."""
-    inverse = np.linalg.inv(T)
+    inverse = se3_inverse(T)
     A = adjoint(inverse)
     return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)
+
+
+def pose_covariance(solution: Solution, precision: Array, mode_sigmas: Array) -> Array:
+    """6x6 covariance (ROS meaning) at the solution.
+
+    Inverse of (weighted observed information of the data + precision of the prior), plus what one sigma of every
+    shared depth mode of either view does to the optimum.
+
+    Args:
+        solution: pose, pairs of the last rung and weight of the data term.
+        precision: 6x6 inverse covariance of the prior, left twist.
+        mode_sigmas: (6,) sigmas of the relative depth error modes of one view.
+    """
+    H = solution.weight * curvature(solution.posterior.data, OPEN_DIRECTION) + precision
+    inverse = np.linalg.inv(H)
+    covariance = inverse.copy()
+    for view in ("source", "target"):
+        effect = inverse @ (solution.weight * _gradient_per_mode(solution, view)) * mode_sigmas
+        covariance += effect @ effect.T
+    return ros_from_twist(0.5 * (covariance + covariance.T), solution.T)
+
+
+def _gradient_per_mode(solution: Solution, view: str) -> Array:
+    """(6, m) change of the data gradient per unit of each depth mode of one view, by central differences."""
+    columns = []
+    for mode in range(MODES):
+        ahead, behind = (
+            two_way(*_with_depth_error(solution, view, mode, step), solution.T).gradient
+            for step in (RELATIVE_STEP, -RELATIVE_STEP)
+        )
+        columns.append((ahead - behind) / (2 * RELATIVE_STEP))
+    return np.stack(columns, axis=1)
+
+
+def _with_depth_error(solution: Solution, view: str, mode: int, step: float) -> tuple[Pairs, Pairs]:
+    forward, backward = solution.pairs
+    if view == "source":
+        return _rows_scaled(forward, mode, step), _partners_scaled(backward, mode, step)
+    return _partners_scaled(forward, mode, step), _rows_scaled(backward, mode, step)
+
+
+def _factor(points: torch.Tensor, mode: int, step: float) -> torch.Tensor:
+    shape = depth_modes(points.reshape(-1, 3).double().cpu().numpy())[:, mode]
+    return torch.as_tensor(1 + step * shape, dtype=points.dtype, device=points.device).reshape(points.shape[:-1])
+
+
+def _rows_scaled(pairs: Pairs, mode: int, step: float) -> Pairs:
+    return replace(pairs, means=pairs.means * _factor(pairs.means, mode, step)[:, None])
+
+
+def _partners_scaled(pairs: Pairs, mode: int, step: float) -> Pairs:
+    points = pairs.partner_means.permute(1, 2, 0)
+    return replace(pairs, partner_means=pairs.partner_means * _factor(points, mode, step))

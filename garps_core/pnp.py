@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metric pose from matches: each view's 3D points against the other's pixels, both directions in one estimate.
+
+PoseLib finds the pose and its inliers; the joint refinement and its covariance are ours, since the covariance is
+what the alignment takes as the prior. A residual's noise is the pixel noise plus what the depth noise of its 3D
+point does to the pixel; errors that all points of a view share (scale, slow warp of a depth map) do not average
+out, and are added through their effect on the pose (`systematic.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import poselib
+
+from garps_core.config import Config, Lifting
+from garps_core.errors import InitialisationError
+from garps_core.features import Matches
+from garps_core.geometry import Array, adjoint, project, se3_exp, se3_inverse, skew, transform
+from garps_core.reconstruct import depth_sigma
+from garps_core.systematic import depth_modes
+from garps_core.types import Prior, View
+from garps_core.uncertainty import ros_from_twist
+
+MIN_PIXEL_SIGMA = 0.3
+HUBER = 2.0
+"""Residuals beyond this many sigmas count with their length, not its square."""
+REFINEMENT_STEPS = 8
+
+Bool = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class OneWay:
+    """3D points (n, 3) m of one view and where the other view, with intrinsics K, saw them: px (n, 2)."""
+
+    points: Array
+    px: Array
+    K: Array
+
+
+def pose_from_matches(matches: Matches, source: View, target: View, config: Config) -> Prior:
+    """Pose with covariance from matches with depth. Raises InitialisationError with the counts when it cannot."""
+    has_s, has_t = (np.isfinite(p[:, 0]) for p in (matches.source_points, matches.target_points))
+    forward = OneWay(matches.source_points[has_s], matches.target_px[has_s], target.K)
+    backward = OneWay(matches.target_points[has_t], matches.source_px[has_t], source.K)
+    candidates = [
+        pose
+        for pose in (_ransac(forward, target, config), _inverse(_ransac(backward, source, config)))
+        if pose is not None
+    ]
+    need, threshold = config.start.min_inliers, config.start.ransac_px
+    scored = [(_inliers(forward, T, threshold), _inliers(backward, se3_inverse(T), threshold), T) for T in candidates]
+    if not scored:
+        raise InitialisationError(f"{len(matches)} feature matches, {has_s.sum()} with depth: no pose fits them")
+    inlier_f, inlier_b, T = max(scored, key=lambda s: int(s[0].sum() + s[1].sum()))
+    count = int(max(inlier_f.sum(), inlier_b.sum()))
+    if count < need:
+        raise InitialisationError(f"{len(matches)} feature matches, {count} fit one pose: expected at least {need}")
+    ways = (_keep(forward, inlier_f), _keep(backward, inlier_b))
+    T, covariance = _refine(T, *ways, config)
+    reason = f"{len(matches)} feature matches, {count} inliers"
+    return Prior(T, covariance, "features", reason)
+
+
+def _ransac(way: OneWay, seen_by: View, config: Config) -> Array | None:
+    """Pose that maps way.points into the camera that saw way.px; None when there is none."""
+    if len(way.points) < max(4, config.start.min_inliers):
+        return None
+    height, width = seen_by.rgb.shape[:2]
+    parameters = [way.K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    camera = {"model": "PINHOLE", "width": width, "height": height, "params": parameters}
+    options = {"max_reproj_error": config.start.ransac_px, "seed": config.seed, "max_iterations": 10_000}
+    pose, info = poselib.estimate_absolute_pose(way.px, way.points, camera, options, {})
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = pose.R, pose.t
+    return T if info["num_inliers"] >= 4 and np.isfinite(T).all() else None
+
+
+def _inverse(T: Array | None) -> Array | None:
+    return None if T is None else se3_inverse(T)
+
+
+def _inliers(way: OneWay, T: Array, threshold_px: float) -> Bool:
+    moved = transform(T, way.points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.linalg.norm(project(way.K, moved) - way.px, axis=-1)
+    return np.asarray((moved[:, 2] > 0.01) & (error < threshold_px))
+
+
+def _keep(way: OneWay, mask: Bool) -> OneWay:
+    return OneWay(way.points[mask], way.px[mask], way.K)
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations of one direction over the left twist of the pose that moves its points."""
+
+    H: Array
+    b: Array
+    shared: Array
+    """(6, m) d b / d (depth mode), one column per mode a whole depth map may share."""
+    residual_px: Array
+
+
+def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> _Normal:
+    moved = transform(T, way.points)
+    x, y, z = moved.T
+    residual = project(way.K, moved) - way.px
+    D = np.zeros((len(z), 2, 3))  # d pixel / d point in the seeing camera
+    D[:, 0, 0], D[:, 0, 2] = way.K[0, 0] / z, -way.K[0, 0] * x / z**2
+    D[:, 1, 1], D[:, 1, 2] = way.K[1, 1] / z, -way.K[1, 1] * y / z**2
+    J = np.concatenate([D, -D @ np.stack([skew(p) for p in moved])], axis=2) if len(z) else np.zeros((0, 2, 6))
+    along = D @ (T[:3, :3] @ way.points.T).T[..., None]  # pixels per unit of relative depth
+    relative = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / np.maximum(way.points[:, 2], 1e-6)
+    C = pixel_sigma**2 * np.eye(2) + along @ along.transpose(0, 2, 1) * relative[:, None, None] ** 2
+    W = np.linalg.inv(C)
+    size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
+    W = W * np.minimum(1.0, HUBER / size)[:, None, None]
+    JW = J.transpose(0, 2, 1) @ W
+    modes = depth_modes(way.points)
+    return _Normal(
+        (JW @ J).sum(0), (JW @ residual[..., None])[..., 0].sum(0), (JW @ along)[..., 0].T @ modes, residual
+    )
+
+
+def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
+    """Robust joint Gauss-Newton over both directions; pose and its covariance (ROS meaning)."""
+    sigma = 1.0
+    for _ in range(REFINEMENT_STEPS):
+        f, b, A = _both(T, forward, backward, sigma, config)
+        T = se3_exp(-np.linalg.solve(f.H + A.T @ b.H @ A + 1e-9 * np.eye(6), f.b + A.T @ b.b)) @ T
+        error = np.concatenate([f.residual_px.ravel(), b.residual_px.ravel()])
+        sigma = max(1.4826 * float(np.median(np.abs(error))), MIN_PIXEL_SIGMA)
+    f, b, A = _both(T, forward, backward, sigma, config)
+    H = f.H + A.T @ b.H @ A + 1e-9 * np.eye(6)
+    # both directions use the same matches: their pixel noise is one noise, counted twice in H
+    covariance = 2.0 * np.linalg.inv(H) * config.start.covariance_inflation**2
+    for shared in (f.shared, A.T @ b.shared):
+        effect = np.linalg.solve(H, shared) * config.lifting.mode_sigmas()
+        covariance += effect @ effect.T
+    return T, ros_from_twist(covariance, T)
+
+
+def _both(
+    T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config
+) -> tuple[_Normal, _Normal, Array]:
+    inverse = se3_inverse(T)
+    f = _normal_equations(forward, T, sigma, config.lifting)
+    b = _normal_equations(backward, inverse, sigma, config.lifting)
+    return f, b, -adjoint(inverse)
