@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.pnp import Failure, features_pnp
+from garps_core.checks import Float64Array
 from garps_core.geometry import pixel_rays
-from garps_core.types import Float64Array, View
+from garps_core.types import View
 
 Levels = tuple[tuple[float, float], ...]
 LEVELS: Levels = ((0.08, 0.5), (0.04, 0.25), (0.02, 0.1))

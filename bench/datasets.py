@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.geometry import pixel_rays, skew, transform
-from garps_core.types import Float32Array, Float64Array, Prior, View, checked_rigid
+from garps_core.types import Prior, View
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RGBD_SETS = ("hololens_lounge", "tum_fr1_rpy")

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from garps_core.checks import Float64Array
 from garps_core.geometry import pixel_rays, project, se3_inverse, transform
-from garps_core.types import Float64Array, View
+from garps_core.types import View
 
 FEATURES = 4000
 MATCH_RATIO = 0.8

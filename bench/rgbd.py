@@ -23,7 +23,7 @@ from bench.baselines import METHODS, NEED_NO_START
 from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, with_monocular_depth
 from bench.tables import Row, machine_facts, print_tables, summarise, write
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
-from garps_core.types import Float64Array
+from garps_core.checks import Float64Array
 
 GARPS, START = "garps", "(start)"
 STARTS = ("features", "disturbed", "identity")

@@ -29,7 +29,7 @@ from bench.baselines import METHODS
 from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, scene_points
 from bench.tables import machine_facts
 from garps_core import Config, PoseEstimate, View, estimate_relative_pose, metrics
-from garps_core.types import Float64Array
+from garps_core.checks import Float64Array
 
 GARPS, GARPS_PRIOR = "garps", "garps, start given"
 PEERS = ("open3d-colored", "open3d-colored-fast", "small-gicp", "sift-pnp")

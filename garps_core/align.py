@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole story: two views -> two mixtures -> initial pose -> alignment -> pose with covariance."""
+"""The whole story: two views -> two mixtures -> initial pose -> alignment -> pose with covariance, or why not."""
 
 from __future__ import annotations
 
@@ -7,51 +7,115 @@ import time
 
 import numpy as np
 
-from garps_core.config import Config
+from garps_core import paper, solve
+from garps_core.checks import Float64Array
+from garps_core.config import Alignment, Config
+from garps_core.errors import InitialisationError
+from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import initialise
 from garps_core.pairing import overlap, to_cloud
 from garps_core.reconstruct import reconstruct
-from garps_core.solve import anneal
+from garps_core.solve import Solution, displacement
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.uncertainty import ros_from_twist, twist_from_ros
+from garps_core.uncertainty import pose_covariance, twist_from_ros
 
 
 def estimate_relative_pose(
     source: View, target: View, config: Config | None = None, prior: Prior | None = None
 ) -> PoseEstimate:
-    """Estimate the metric pose of the source camera in the target camera's frame."""
+    """Estimate the pose of the source camera in the target camera's frame, in metres, with its covariance.
+
+    Args:
+        source, target: two views of the same static scene, with metric depth.
+        config: settings; the default preset when None.
+        prior: what is known of the pose beforehand, if anything; it enters the estimate with its covariance.
+    Returns:
+        PoseEstimate; when no pose could be had its status and reason say why and T_target_source is None.
+    Raises:
+        ReconstructionError: a view holds too little depth.
+        ConfigError: the device is not there.
+    """
     config = config or Config()
-    clock = time.perf_counter
-    start = clock()
+    begin = time.perf_counter()
     x, y = reconstruct(source, config), reconstruct(target, config)
-    lifted = clock()
-    initial = initialise(source, target, config, prior)
-    initialised = clock()
+    lifted = time.perf_counter()
+    try:
+        initial = initialise(source, target, config, prior)
+    except InitialisationError as failure:
+        return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds={"reconstruct": lifted - begin})
+    initialised = time.perf_counter()
     estimate = align_mixtures(x, y, initial, config)
-    estimate.seconds.update(reconstruct=lifted - start, initialise=initialised - lifted)
+    estimate.seconds.update(reconstruct=lifted - begin, initialise=initialised - lifted)
     return estimate
 
 
 def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:
-    """Align."""
+    """Align two mixtures from an initial pose, which counts as a measurement with its covariance.
+
+    Args:
+        source, target: each in its own camera's frame; a frustum, when present, is used to leave out what the
+            other camera cannot see.
+        initial: T_target_source and covariance to start from.
+        config: `config.alignment`, `device` and `dtype` are used; the default preset when None.
+    Returns:
+        PoseEstimate; `objective` is the mean of the two-way "log" objective, or the paper's log f.
+    Raises:
+        ConfigError: the device is not there.
+    """
     config = config or Config()
     settings = config.alignment
     begin = time.perf_counter()
     x, y = to_cloud(source, config), to_cloud(target, config)
     T0 = initial.T_target_source
-    precision = np.linalg.inv(twist_from_ros(initial.covariance, T0))
-    solution = anneal(x, y, T0, precision, settings.ladder, settings)
-    if solution is None:
-        return PoseEstimate(Status.LOW_OVERLAP, "few", initial=initial)
-    C = ros_from_twist(np.linalg.inv(solution.posterior.information), solution.T)
+    start_covariance = twist_from_ros(initial.covariance, T0)
+    maximise = paper.maximise if settings.solver == "adam" else solve.anneal
+    solution = maximise(x, y, T0, start_covariance, settings)
+    shared = overlap(x, y, T0 if solution is None else solution.T, settings)
+    if solution is None or shared < settings.min_overlap:
+        reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
+        return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
+    precision = np.asarray(np.linalg.inv(start_covariance), np.float64)
+    covariance = pose_covariance(solution, precision, config.lifting.mode_sigmas())
+    status, reason = _verdict(solution, T0, precision, _relative_uncertainty(source, solution.T, covariance), settings)
     return PoseEstimate(
-        Status.CONVERGED if solution.converged else Status.MAX_ITERATIONS,
-        "",
+        status,
+        reason,
         solution.T,
-        C,
+        covariance,
         initial,
-        overlap(x, y, solution.T, settings),
+        shared,
         solution.iterations,
         solution.posterior.data.value,
         {"align": time.perf_counter() - begin},
     )
+
+
+def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64Array) -> float:
+    """Sigma of a typical scene point along its most uncertain direction, as a share of its range in the target."""
+    points = source.means[:: max(1, len(source) // 200)].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+    spread = np.linalg.eigvalsh(displacement(points, twist_from_ros(covariance, T)))[:, 2]
+    return float(np.median(np.sqrt(spread) / np.linalg.norm(points, axis=1)))
+
+
+def _verdict(
+    solution: Solution, T0: Float64Array, precision: Float64Array, uncertainty: float, settings: Alignment
+) -> tuple[Status, str]:
+    """Status and reason of a solution, the gravest first."""
+    if settings.solver == "adam":
+        return Status.CONVERGED, f"the paper's fixed number of steps, {solution.iterations}"
+    r = se3_log(solution.T @ se3_inverse(T0))
+    distance = float(np.sqrt(r @ precision @ r))
+    if distance > settings.max_prior_sigmas:
+        return (
+            Status.INCONSISTENT,
+            f"the views pull {distance:.1f} sigmas away from the initial pose ({settings.max_prior_sigmas:g} allowed)",
+        )
+    if uncertainty > settings.max_uncertainty:
+        return (
+            Status.DEGENERATE,
+            f"a direction stays open: scene points are uncertain by {uncertainty:.1%} of their range "
+            f"({settings.max_uncertainty:.1%} allowed)",
+        )
+    if not solution.converged:
+        return Status.MAX_ITERATIONS, f"still moving after {solution.iterations} steps"
+    return Status.CONVERGED, f"converged in {solution.iterations} steps, {distance:.1f} sigmas from the initial pose"

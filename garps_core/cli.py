@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from garps_core import __version__
 from garps_core.align import estimate_relative_pose
+from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.config import Config
 from garps_core.errors import ConfigError, GarpsError, InputError
 from garps_core.files import read_view
 from garps_core.reconstruct import reconstruct
 from garps_core.report import as_json, as_text
-from garps_core.types import Float64Array, PoseEstimate, Prior, View, checked_intrinsics
+from garps_core.types import PoseEstimate, Prior, View
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -79,7 +79,6 @@ class Lifting(_Checked):
         "area", "component weights: surface area seen, or one per pixel", choices=("area", "equal")
     )
 
-
     def mode_sigmas(self) -> npt.NDArray[np.float64]:
         """Sigmas (6,) of the depth modes of `systematic.py`: scale, then five of warp."""
         return np.array([self.scale_sigma] + [self.warp_sigma] * 5)
@@ -148,10 +147,20 @@ class Alignment(_Checked):
         0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
     )
     information: float = setting(
-        10.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
+        30.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
     )
     tolerance: float = setting(0.02, "a step shorter than this many of its own sigmas is converged", low=1e-9, high=1)
     min_overlap: float = setting(0.1, "smaller overlap is refused", unit="", low=0, high=1)
+    max_prior_sigmas: float = setting(
+        8.0, "a pose further than this from the initial one is called inconsistent", unit="sigma", low=1, high=1e6
+    )
+    max_uncertainty: float = setting(
+        0.05,
+        "degenerate when scene points stay uncertain by more than this share of their range",
+        low=1e-6,
+        high=1e6,
+    )
+    component_stride: int = setting(1, "paper's solver: use every n-th component", low=1, high=100_000)
     opacity_threshold: float = setting(0.0, "drop components of smaller weight", low=0, high=1)
     adam_rate_translation: float = setting(9e-5, "Adam's rate for the translation", unit="m", low=0, high=1)
     adam_rate_rotation: float = setting(3e-6, "Adam's rate for the quaternion", unit="", low=0, high=1)
@@ -171,7 +180,12 @@ class Config(_Checked):
     @classmethod
     def preset(cls, name: str) -> Config:
         """A named configuration: "default", "sensor", "monocular" or "paper". Raises ConfigError on another name."""
-        presets = {"default": cls, "sensor": cls, "monocular": _monocular, "paper": _paper}
+        presets: dict[str, Callable[[], Config]] = {
+            "default": cls,
+            "sensor": cls,
+            "monocular": _monocular,
+            "paper": _paper,
+        }
         if name not in presets:
             raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(presets)}")
         return presets[name]()
@@ -211,11 +225,12 @@ def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
 def _monocular() -> Config:
     """Metric depth from one image: right to a few per cent in scale and shape, so long along each ray."""
     return Config(
-        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, smoothing_px=0, scale_sigma=0.03, warp_sigma=0.02),
+        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, scale_sigma=0.03, warp_sigma=0.02),
         alignment=Alignment(
             ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 8)),
             colour_variance=0.01,
             depth_weight=0.2,
+            information=3.0,
         ),
     )
 
@@ -228,6 +243,8 @@ def _paper() -> Config:
             solver="adam",
             ladder=(Rung(90.0, 1_000_000, 30, 1000),),
             colour_variance=0.4,
+            component_stride=32,
             opacity_threshold=0.5,
+            max_prior_sigmas=1e6,
         ),
     )

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 
 from garps_core.align import align_mixtures
+from garps_core.checks import Float64Array
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
-from garps_core.types import Float64Array, Mixture, Prior
+from garps_core.types import Mixture, Prior
 
 REQUIRED = ("numpy", "scipy", "torch", "cv2", "poselib", "typer")
 OPTIONAL = {

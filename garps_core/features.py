@@ -43,7 +43,7 @@ def match_features(source: View, target: View, start: Start) -> Matches:
 
 def _describe(rgb: npt.NDArray[np.uint8], count: int) -> tuple[Array, npt.NDArray[np.float32]]:
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=count).detectAndCompute(grey, None)
+    keypoints, descriptors = cv2.SIFT.create(nfeatures=count).detectAndCompute(grey, None)
     if descriptors is None:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-7))
@@ -82,4 +82,4 @@ def _points(view: View, px: Array) -> Array:
     flat = farthest - nearest < RELIEF_RATIO * nearest + 0.005
     mean = np.where(seen, patch, 0).sum(1) / np.maximum(seen.sum(1), 1)
     z = np.where(flat & np.isfinite(z), mean, np.nan)  # the patch mean carries less noise than its centre
-    return pixel_rays(view.K, px[:, 0], px[:, 1]) * z[:, None]
+    return np.asarray(pixel_rays(view.K, px[:, 0], px[:, 1]) * z[:, None])

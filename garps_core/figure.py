@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from garps_core.checks import checked_rigid
 from garps_core.errors import InputError
 from garps_core.geometry import Array, transform
-from garps_core.types import Mixture, checked_rigid
+from garps_core.types import Mixture
 
 YELLOW = np.array([242, 178, 0]) / 255
 BLUE = np.array([38, 92, 214]) / 255

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from garps_core.checks import Float32Array, Float64Array
 from garps_core.errors import InputError
-from garps_core.types import MAX_IMAGE_PIXELS, Float32Array, Float64Array, View
+from garps_core.types import MAX_IMAGE_PIXELS, View
 
 MILLIMETRE = 0.001
 

@@ -53,10 +53,7 @@ def se3_log(T: Array) -> Array:
     w = so3_log(T[:3, :3])
     angle = float(np.linalg.norm(w))
     W = skew(w)
-    if angle < 1e-4:
-        d = 1 / 12 + angle**2 / 720
-    else:
-        d = (1 - angle / 2 / np.tan(angle / 2)) / angle**2
+    d = 1 / 12 + angle**2 / 720 if angle < 1e-4 else (1 - angle / 2 / np.tan(angle / 2)) / angle**2
     return np.concatenate([(np.eye(3) - 0.5 * W + d * W @ W) @ T[:3, 3], w])
 
 

@@ -149,8 +149,9 @@ def _combine(
         missing -= cU[:, :, None] * cU[:, None, :] / weights.clamp_min(1e-300)[:, None, None]
     J = torch.zeros(len(moved), 3, 6, dtype=moved.dtype, device=moved.device)
     J[:, range(3), range(3)] = 1
-    for row, column, sign, axis in ((0, 4, 1, 2), (0, 5, -1, 1), (1, 3, -1, 2), (1, 5, 1, 0), (2, 3, 1, 1), (2, 4, -1, 0)):
-        J[:, row, column] = sign * moved[:, axis]
+    x, y, z = moved.unbind(1)
+    J[:, 0, 4], J[:, 0, 5], J[:, 1, 5] = z, -y, x  # -[mu']x
+    J[:, 1, 3], J[:, 2, 3], J[:, 2, 4] = -z, y, -x
     flat = J.reshape(-1, 6)
     information = flat.T @ (cQ @ J).reshape(-1, 6)
     observed = information - flat.T @ (missing @ J).reshape(-1, 6)

@@ -92,7 +92,7 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
     if rows.labels is not None and partners.labels is not None:
         differs = rows.labels[None] != partners.labels[chosen]
         log_weights = log_weights + differs * float(np.log(max(settings.semantic_discount, 1e-30)))
-    log_weights = log_weights.masked_fill(distance.T > settings.max_distance_m, -torch.inf)
+    log_weights = log_weights.masked_fill(settings.max_distance_m < distance.T, -torch.inf)
     scale = rung.covariance_scale
     covariances = rows.covariances * scale
     return Pairs(
@@ -115,7 +115,7 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     if depth_weight < 1:
         moved, them = _image_coordinates(moved, depth_weight), _image_coordinates(them, depth_weight)
     if like.is_cuda:
-        found = [torch.cdist(block, them).topk(k, largest=False) for block in moved.split(4096)]
+        found = [torch.cdist(block, them).topk(k, largest=False) for block in torch.split(moved, 4096)]
         return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
     distance, index = cKDTree(them.numpy(), balanced_tree=False, compact_nodes=False).query(
         moved.numpy(), k=k, workers=-1
@@ -135,7 +135,7 @@ def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) 
     cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
     for channel in range(3):
         cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    return cost / (4 * variance)
+    return torch.as_tensor(cost / (4 * variance))
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:

@@ -18,7 +18,7 @@ from garps_core.config import Alignment
 from garps_core.geometry import Array, skew
 from garps_core.objective import Pairs, evaluate
 from garps_core.pairing import Cloud, pair_up, without_floor
-from garps_core.solve import MIN_ROWS, Posterior, Solution, posterior
+from garps_core.solve import MIN_ROWS, Solution, posterior
 
 
 def salient(cloud: Cloud, settings: Alignment) -> Cloud:
@@ -82,5 +82,7 @@ def maximise(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, se
     rung = settings.ladder[0]
     T = adam_path(pairs, T_prior, settings, rung.steps)[-1]
     weight = settings.information * rung.covariance_scale
-    end: Posterior = posterior(evaluate(pairs, T, "sum"), T, T_prior, np.linalg.inv(covariance), weight)
-    return Solution(T, end, rung.steps, True, (pairs, pairs), weight)
+    end: Posterior = posterior(
+        evaluate(pairs, T, "sum"), T, T_prior, np.asarray(np.linalg.inv(covariance), np.float64), weight
+    )
+    return Solution(T, end, rung.steps, True, None, weight)

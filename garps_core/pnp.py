@@ -121,9 +121,7 @@ def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Liftin
     W = W * np.minimum(1.0, HUBER / size)[:, None, None]
     JW = J.transpose(0, 2, 1) @ W
     modes = depth_modes(way.points)
-    return _Normal(
-        (JW @ J).sum(0), (JW @ residual[..., None])[..., 0].sum(0), (JW @ along)[..., 0].T @ modes, residual
-    )
+    return _Normal((JW @ J).sum(0), (JW @ residual[..., None])[..., 0].sum(0), (JW @ along)[..., 0].T @ modes, residual)
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
@@ -131,7 +129,8 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     sigma = 1.0
     for _ in range(REFINEMENT_STEPS):
         f, b, A = _both(T, forward, backward, sigma, config)
-        T = se3_exp(-np.linalg.solve(f.H + A.T @ b.H @ A + 1e-9 * np.eye(6), f.b + A.T @ b.b)) @ T
+        step = -np.linalg.solve(f.H + A.T @ b.H @ A + 1e-9 * np.eye(6), f.b + A.T @ b.b)
+        T = se3_exp(np.asarray(step, np.float64)) @ T
         error = np.concatenate([f.residual_px.ravel(), b.residual_px.ravel()])
         sigma = max(1.4826 * float(np.median(np.abs(error))), MIN_PIXEL_SIGMA)
     f, b, A = _both(T, forward, backward, sigma, config)
@@ -141,12 +140,10 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     for shared in (f.shared, A.T @ b.shared):
         effect = np.linalg.solve(H, shared) * config.lifting.mode_sigmas()
         covariance += effect @ effect.T
-    return T, ros_from_twist(covariance, T)
+    return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 
 
-def _both(
-    T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config
-) -> tuple[_Normal, _Normal, Array]:
+def _both(T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config) -> tuple[_Normal, _Normal, Array]:
     inverse = se3_inverse(T)
     f = _normal_equations(forward, T, sigma, config.lifting)
     b = _normal_equations(backward, inverse, sigma, config.lifting)

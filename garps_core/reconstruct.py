@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from garps_core.checks import Float32Array
 from garps_core.config import Config, Lifting
 from garps_core.errors import ReconstructionError
-from garps_core.types import Float32Array, Frustum, Mixture, View
+from garps_core.types import Frustum, Mixture, View
 
 MIN_COMPONENTS = 50
 FRUSTUM_STEP_PX = 4

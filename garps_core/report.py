@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from garps_core.types import Float64Array, PoseEstimate
+from garps_core.checks import Float64Array
+from garps_core.types import PoseEstimate
 
 
 def as_json(estimate: PoseEstimate) -> dict[str, Any]:

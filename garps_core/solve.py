@@ -16,7 +16,7 @@ import numpy as np
 
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, skew
-from garps_core.objective import Evaluation, Pairs, evaluate
+from garps_core.objective import Evaluation, Pairs, evaluate, unpack
 from garps_core.pairing import Cloud, pair_up, thin, visible
 
 MIN_ROWS = 50
@@ -44,8 +44,8 @@ class Solution:
     posterior: Posterior
     iterations: int
     converged: bool
-    pairs: tuple[Pairs, Pairs]
-    """Source rows to target partners, and target rows to source partners, of the last rung."""
+    pairs: tuple[Pairs, Pairs] | None
+    """Source rows to target partners, and target rows to source partners, of the last rung; None for the paper's."""
     weight: float
     """What the data term was multiplied with: effective number of independent measurements of the last rung."""
 
@@ -80,13 +80,18 @@ def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE) -> Array:
     Gauss-Newton holds the assignment of partners fixed and so takes steps that are too short (expectation
     maximisation); the observed information knows that partners change, but may be indefinite far from the optimum.
     """
+    values, half, scale = _shares(data)
+    half = half * np.sqrt(np.clip(values, smallest, 1.0))
+    return np.asarray((half @ half.T) / np.outer(scale, scale))
+
+
+def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
+    """Eigenvalues of the observed in units of the Gauss-Newton information, their directions, and the scaling used."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.information), 1e-12))
-    full = data.information * np.outer(scale, scale) + 1e-9 * np.eye(6)
-    L = np.linalg.cholesky(full)
+    L = np.linalg.cholesky(data.information * np.outer(scale, scale) + 1e-9 * np.eye(6))
     inner = np.linalg.solve(L, np.linalg.solve(L, data.observed * np.outer(scale, scale)).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    half = L @ (vectors * np.sqrt(np.clip(values, smallest, 1.0)))
-    return np.asarray((half @ half.T) / np.outer(scale, scale))
+    return values, L @ vectors, scale
 
 
 def posterior(data: Evaluation, T: Array, T_prior: Array, precision: Array, weight: float) -> Posterior:
@@ -121,9 +126,9 @@ def climb(function: Callable[[Array], Posterior], T: Array, steps: int, toleranc
     while used < steps:
         H = here.information
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(6), here.gradient)
-        if float(np.sqrt(max(step @ H @ step, 0.0))) < tolerance:
+        if float(step @ H @ step) < tolerance**2:
             return Climb(T, here, used, True)
-        there_T = se3_exp(step) @ T
+        there_T = se3_exp(np.asarray(step, np.float64)) @ T
         there = function(there_T)
         used += 1
         if there.value >= here.value:
@@ -144,18 +149,27 @@ def rung_pairs(source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Ali
     return pair_up(x_seen, y_seen, T, rung, settings), pair_up(y_seen, x_seen, back, rung, settings)
 
 
+def displacement(points: Array, covariance: Array) -> Array:
+    """(n, 3, 3) covariance of points (n, 3) m moved by a pose with the given 6x6 covariance (left twist)."""
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -np.stack([skew(p) for p in points])], axis=2)
+    return np.asarray(J @ covariance @ J.transpose(0, 2, 1))
+
+
 def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:
     """Index of the first rung worth running: a precise start needs no wide kernels.
 
     covariance is the start's, over the left twist. Its effect on the source points is compared with the rungs' widths.
     """
-    points = thin(source, 200).means.double().cpu().numpy() @ T[:3, :3].T + T[:3, 3]
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -np.stack([skew(p) for p in points])], axis=2)
-    uncertainty = np.sqrt(np.median(np.einsum("nij,jk,nik->n", J, covariance, J)) / 3)
-    spread = source.covariances.double()
-    width = np.sqrt(float((spread[:, 0] + spread[:, 3] + spread[:, 5]).median()) / 3)
+    few = thin(source, 200)
+    points = few.means.double().cpu().numpy() @ T[:3, :3].T + T[:3, 3]
+    uncertainty = float(np.sqrt(np.median(np.trace(displacement(points, covariance), axis1=1, axis2=2)) / 3))
+    spread = np.linalg.eigvalsh(unpack(few.covariances).double().cpu().numpy())
+    width = np.sqrt(np.median(spread[:, 1]))  # the footprint, neither the thin normal nor the long ray
     first = 0
-    while first + 1 < len(ladder) and np.sqrt(ladder[first + 1].covariance_scale) * width > ENTRY_WIDTH * uncertainty:
+    while (
+        first + 1 < len(ladder)
+        and float(np.sqrt(ladder[first + 1].covariance_scale)) * width > ENTRY_WIDTH * uncertainty
+    ):
         first += 1
     return first
 
@@ -167,7 +181,7 @@ def anneal(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, sett
         source, target: mixtures on the device.
         T_prior: 4x4 start. covariance: its 6x6, left twist.
     """
-    precision = np.linalg.inv(covariance)
+    precision = np.asarray(np.linalg.inv(covariance), np.float64)
     T, used = T_prior, 0
     solution: Solution | None = None
     for rung in settings.ladder[entry(source, T_prior, covariance, settings.ladder) :]:

@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from garps_core.checks import Float64Array, FloatArray
 from garps_core.errors import InputError
 from garps_core.geometry import transform
-from garps_core.types import Float64Array, FloatArray, Mixture
+from garps_core.types import Mixture
 
 SH_CONSTANT = 0.28209479177387814
 """Y_0^0 = 1 / (2 sqrt(pi)); a colour c is stored as (c - 0.5) / SH_CONSTANT."""

@@ -19,6 +19,8 @@ from garps_core.systematic import MODES, depth_modes
 
 RELATIVE_STEP = 1e-3
 """Relative depth change by which the effect of a shared depth error is probed."""
+MODE_ROWS = 1000
+"""Rows per direction that probe the effect of shared depth errors."""
 OPEN_DIRECTION = 1e-3
 """Directions in which re-assigning partners cancels the curvature keep this share of it: a very large variance."""
 
@@ -62,7 +64,7 @@ def pose_covariance(solution: Solution, precision: Array, mode_sigmas: Array) ->
     H = solution.weight * curvature(solution.posterior.data, OPEN_DIRECTION) + precision
     inverse = np.linalg.inv(H)
     covariance = inverse.copy()
-    for view in ("source", "target"):
+    for view in ("source", "target") if solution.pairs else ():
         effect = inverse @ (solution.weight * _gradient_per_mode(solution, view)) * mode_sigmas
         covariance += effect @ effect.T
     return ros_from_twist(0.5 * (covariance + covariance.T), solution.T)
@@ -70,18 +72,34 @@ def pose_covariance(solution: Solution, precision: Array, mode_sigmas: Array) ->
 
 def _gradient_per_mode(solution: Solution, view: str) -> Array:
     """(6, m) change of the data gradient per unit of each depth mode of one view, by central differences."""
+    few = tuple(_thinned(pairs) for pairs in solution.pairs or ())
     columns = []
     for mode in range(MODES):
         ahead, behind = (
-            two_way(*_with_depth_error(solution, view, mode, step), solution.T).gradient
+            two_way(*_with_depth_error(few, view, mode, step), solution.T).gradient
             for step in (RELATIVE_STEP, -RELATIVE_STEP)
         )
         columns.append((ahead - behind) / (2 * RELATIVE_STEP))
     return np.stack(columns, axis=1)
 
 
-def _with_depth_error(solution: Solution, view: str, mode: int, step: float) -> tuple[Pairs, Pairs]:
-    forward, backward = solution.pairs
+def _thinned(pairs: Pairs) -> Pairs:
+    """At most MODE_ROWS rows, evenly: a smooth depth error needs no more to show its effect."""
+    step = max(1, len(pairs.means) // MODE_ROWS)
+    weights = pairs.weights[::step]
+    return Pairs(
+        pairs.means[::step],
+        pairs.covariances[::step],
+        weights / weights.sum(),
+        pairs.log_floor[::step],
+        pairs.partner_means[:, :, ::step].contiguous(),
+        pairs.partner_covariances[:, :, ::step].contiguous(),
+        pairs.log_weights[:, ::step].contiguous(),
+    )
+
+
+def _with_depth_error(pairs: tuple[Pairs, ...], view: str, mode: int, step: float) -> tuple[Pairs, Pairs]:
+    forward, backward = pairs
     if view == "source":
         return _rows_scaled(forward, mode, step), _partners_scaled(backward, mode, step)
     return _partners_scaled(forward, mode, step), _rows_scaled(backward, mode, step)

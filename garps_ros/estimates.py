@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
-from garps_core.types import Float64Array, PoseEstimate, View
+from garps_core.types import PoseEstimate, View
 from garps_ros.frames import Frame, Frames
 from garps_ros.outputs import Row
 from garps_ros.tracking import Estimator, KeyframeTracker

@@ -16,7 +16,7 @@ from typing import IO, Final
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from garps_core.types import Float64Array
+from garps_core.checks import Float64Array
 from garps_ros.bags import BagError
 from msg_adapters import PoseWriter, ns_to_stamp
 

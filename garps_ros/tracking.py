@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from garps_core.checks import Float64Array
 from garps_core.geometry import skew, so3_log
-from garps_core.types import Float64Array, PoseEstimate, View
+from garps_core.types import PoseEstimate, View
 
 Estimator = Callable[[View, View], PoseEstimate]
 
