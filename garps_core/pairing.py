@@ -131,11 +131,11 @@ def _image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
 
 
 def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:
-    """Half the squared Mahalanobis distance of the colours, both with `variance` per channel."""
+    """Half the squared Mahalanobis distance (k, n) of the colours, both with `variance` per channel."""
     cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
     for channel in range(3):
         cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    return torch.as_tensor(cost / (4 * variance))
+    return cost.div_(4 * variance)
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:

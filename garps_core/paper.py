@@ -82,7 +82,6 @@ def maximise(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, se
     rung = settings.ladder[0]
     T = adam_path(pairs, T_prior, settings, rung.steps)[-1]
     weight = settings.information * rung.covariance_scale
-    end: Posterior = posterior(
-        evaluate(pairs, T, "sum"), T, T_prior, np.asarray(np.linalg.inv(covariance), np.float64), weight
-    )
+    precision = np.asarray(np.linalg.inv(covariance), np.float64)
+    end = posterior(evaluate(pairs, T, "sum"), T, T_prior, precision, weight)
     return Solution(T, end, rung.steps, True, None, weight)

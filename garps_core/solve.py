@@ -164,12 +164,9 @@ def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) 
     points = few.means.double().cpu().numpy() @ T[:3, :3].T + T[:3, 3]
     uncertainty = float(np.sqrt(np.median(np.trace(displacement(points, covariance), axis1=1, axis2=2)) / 3))
     spread = np.linalg.eigvalsh(unpack(few.covariances).double().cpu().numpy())
-    width = np.sqrt(np.median(spread[:, 1]))  # the footprint, neither the thin normal nor the long ray
+    width = float(np.sqrt(np.median(spread[:, 1])))  # the footprint, neither the thin normal nor the long ray
     first = 0
-    while (
-        first + 1 < len(ladder)
-        and float(np.sqrt(ladder[first + 1].covariance_scale)) * width > ENTRY_WIDTH * uncertainty
-    ):
+    while first + 1 < len(ladder) and ladder[first + 1].covariance_scale ** 0.5 * width > ENTRY_WIDTH * uncertainty:
         first += 1
     return first
 
