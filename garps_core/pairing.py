@@ -135,7 +135,8 @@ def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) 
     cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
     for channel in range(3):
         cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    return cost.div_(4 * variance)
+    cost /= 4 * variance
+    return cost
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:
