@@ -4,18 +4,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
+import torch
 
 from garps_core import paper, solve
 from garps_core.checks import Float64Array
 from garps_core.config import Alignment, Config
-from garps_core.errors import InitialisationError
+from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import initialise
-from garps_core.pairing import overlap, to_cloud
+from garps_core.pairing import checked_device, overlap, to_cloud
 from garps_core.reconstruct import reconstruct
-from garps_core.solve import Solution, displacement
+from garps_core.solve import MIN_ROWS, Solution, displacement
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.uncertainty import pose_covariance, twist_from_ros
 
@@ -36,6 +39,7 @@ def estimate_relative_pose(
         ConfigError: the device is not there.
     """
     config = config or Config()
+    checked_device(config.device)
     begin = time.perf_counter()
     x, y = reconstruct(source, config), reconstruct(target, config)
     lifted = time.perf_counter()
@@ -60,12 +64,18 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
     Returns:
         PoseEstimate; `objective` is the mean of the two-way "log" objective, or the paper's log f.
     Raises:
+        InputError: a mixture has fewer than 50 components.
         ConfigError: the device is not there.
     """
     config = config or Config()
-    settings = config.alignment
     begin = time.perf_counter()
+    for name, mixture in (("source", source), ("target", target)):
+        if len(mixture) < MIN_ROWS:
+            raise InputError(
+                f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
+            )
     x, y = to_cloud(source, config), to_cloud(target, config)
+    settings = config.alignment
     T0 = initial.T_target_source
     start_covariance = twist_from_ros(initial.covariance, T0)
     maximise = paper.maximise if settings.solver == "adam" else solve.anneal
@@ -73,6 +83,8 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
     shared = overlap(x, y, T0 if solution is None else solution.T, settings)
     if solution is None or shared < settings.min_overlap:
         reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
+        if shared >= settings.min_overlap:  # then the solver gave up
+            reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
         return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
     precision = np.asarray(np.linalg.inv(start_covariance), np.float64)
     covariance = pose_covariance(solution, precision, config.lifting.mode_sigmas())
@@ -86,8 +98,19 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
         shared,
         solution.iterations,
         solution.posterior.data.value,
-        {"align": time.perf_counter() - begin},
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch to the calling thread: its helpers gain nothing on planes that fit the cache, and on a busy machine
+    their busy-waiting makes every operation many times slower. The old number comes back afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64Array) -> float:

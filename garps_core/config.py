@@ -31,6 +31,9 @@ def setting(
     return field(default=default, metadata={"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices})
 
 
+_KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
+
+
 class _Checked:
     """Checks every field of a settings dataclass against its own description."""
 
@@ -42,6 +45,10 @@ class _Checked:
                 raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
             if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
                 _check_number(name, value, f.default, limits)
+            elif not isinstance(value, type(f.default)):
+                raise ConfigError(
+                    f"{name} is {value!r}: expected {_KINDS.get(type(f.default), type(f.default).__name__)}"
+                )
 
 
 def _check_number(name: str, value: Any, default: float, limits: Mapping[str, Any]) -> None:
@@ -165,6 +172,11 @@ class Alignment(_Checked):
     adam_rate_translation: float = setting(9e-5, "Adam's rate for the translation", unit="m", low=0, high=1)
     adam_rate_rotation: float = setting(3e-6, "Adam's rate for the quaternion", unit="", low=0, high=1)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.ladder or not all(isinstance(rung, Rung) for rung in self.ladder):
+            raise ConfigError(f"alignment.ladder is {self.ladder!r}: expected a tuple of at least one Rung")
+
 
 @dataclass(frozen=True)
 class Config(_Checked):
@@ -215,8 +227,8 @@ def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
     names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
     if path[0] not in names:
         near = difflib.get_close_matches(name, list(Config().settings()), n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ConfigError(f"setting {name!r} does not exist{hint}")
+        hint = f"did you mean {near[0]!r}?" if near else "expected one of the names that Config().settings() lists"
+        raise ConfigError(f"setting {name!r} does not exist; {hint}")
     if len(path) > 1:
         value = _replaced(getattr(part, path[0]), name, path[1:], value)
     return dataclasses.replace(part, **{path[0]: value})

@@ -49,7 +49,10 @@ class Mixture:
     frustum: Frustum | None = None
 
     def __post_init__(self) -> None:
-        n = len(numeric("means", self.means))
+        means = numeric("means", self.means)
+        if means.ndim != 2:
+            raise InputError(f"means have shape {means.shape}: expected Nx3 m")
+        n = len(means)
         for name, shape in (("means", (n, 3)), ("covariances", (n, 3, 3)), ("weights", (n,)), ("colours", (n, 3))):
             object.__setattr__(self, name, _checked_component(name, getattr(self, name), shape))
         if self.labels is not None:
@@ -86,7 +89,7 @@ def _checked_component(name: str, value: Any, shape: tuple[int, ...]) -> FloatAr
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(f"{name} hold NaN or infinity: drop those components first")
+        raise InputError(f"{name} hold NaN or infinity: expected finite numbers, drop those components first")
     return array
 
 

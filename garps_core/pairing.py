@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from garps_core.config import Alignment, Config, Rung
+from garps_core.errors import ConfigError
 from garps_core.geometry import Array, se3_inverse
 from garps_core.objective import Pairs, pack
 from garps_core.types import Frustum, Mixture
@@ -38,14 +39,30 @@ class Cloud:
         )
 
 
+def checked_device(name: str) -> torch.device:
+    """The device `name`. Raises ConfigError when it is none, or not there."""
+    try:
+        device = torch.device(name)
+        if device.type in ("cpu", "cuda"):
+            torch.empty(1, device=device)
+            return device
+    except (RuntimeError, AssertionError):  # an unknown name; torch without CUDA asserts
+        pass
+    there = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    raise ConfigError(
+        f"device is {name!r}, which is not there: expected one of {', '.join(there)}; set device to 'cpu'"
+    )
+
+
 def to_cloud(mixture: Mixture, config: Config) -> Cloud:
-    """Move a mixture to the device and arithmetic of the config."""
+    """Move a mixture to the device and arithmetic of the config. Raises ConfigError when the device is not there."""
+    device = checked_device(config.device)
     dtype = torch.float64 if config.dtype == "float64" else torch.float32
     means, covariances, weights, colours = (
-        torch.as_tensor(np.ascontiguousarray(part), dtype=dtype, device=config.device)
+        torch.as_tensor(np.ascontiguousarray(part), dtype=dtype, device=device)
         for part in (mixture.means, mixture.covariances, mixture.weights, mixture.colours)
     )
-    labels = None if mixture.labels is None else torch.as_tensor(mixture.labels, device=config.device)
+    labels = None if mixture.labels is None else torch.as_tensor(mixture.labels, device=device)
     return Cloud(means, pack(covariances), weights, colours, labels, mixture.frustum)
 
 
@@ -132,11 +149,10 @@ def _image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
 
 def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:
     """Half the squared Mahalanobis distance (k, n) of the colours, both with `variance` per channel."""
-    cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
+    cost: Tensor = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
     for channel in range(3):
         cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    cost /= 4 * variance
-    return cost
+    return cost.mul(1 / (4 * variance))
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:

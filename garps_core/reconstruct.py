@@ -74,11 +74,10 @@ def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
     height, width = depth.shape
     step = max(1, radius)  # a sparse kernel: centre, and eight neighbours at the radius
     with np.errstate(invalid="ignore", divide="ignore"):
-        inverse = 1.0 / sigma
         for dy in range(-radius, radius + 1, step):
             for dx in range(-radius, radius + 1, step):
                 other = padded[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
-                close = np.abs(other - depth) * inverse < 1.0
+                close = np.abs(other - depth) <= sigma  # true for the pixel itself, even where sigma is 0
                 total += np.where(close, other, 0)
                 weight += close
         return np.where(weight > 0, total / weight, np.float32(np.nan)).astype(np.float32)
@@ -127,7 +126,8 @@ def _lift(
     normals = _normals(depth, rows, columns, (fx, fy, cx, cy), lifting.stride)
     length = np.linalg.norm(rays, axis=1)
     cosine = np.maximum(np.abs((normals * rays).sum(1)) / length, np.float32(lifting.min_cosine))
-    area = (z * lifting.stride) ** 2 / (fx * fy) / cosine * length  # pixel solid angle over the cosine, times range^2
+    # the pixel's solid angle, (stride^2 / fx fy) / length^3, times range^2, over the cosine
+    area = (z * lifting.stride) ** 2 / (fx * fy) / (cosine * length)
     covariances = _covariances(z, rays, normals, cosine, depth_sigma(z, lifting), fx, fy, lifting)
     return Mixture._trusted(
         rays * z[:, None],
