@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
@@ -41,7 +42,8 @@ def estimate_relative_pose(
     config = config or Config()
     checked_device(config.device)
     begin = time.perf_counter()
-    x, y = reconstruct(source, config), reconstruct(target, config)
+    with ThreadPoolExecutor(2) as pool:
+        x, y = pool.map(reconstruct, (source, target), (config, config))
     lifted = time.perf_counter()
     try:
         initial = initialise(source, target, config, prior)
@@ -74,6 +76,13 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
             raise InputError(
                 f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
             )
+    with _one_thread():
+        estimate = _aligned(source, target, initial, config)
+    estimate.seconds["align"] = time.perf_counter() - begin
+    return estimate
+
+
+def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -> PoseEstimate:
     x, y = to_cloud(source, config), to_cloud(target, config)
     settings = config.alignment
     T0 = initial.T_target_source

@@ -69,7 +69,7 @@ def checked_covariance(name: str, covariance: Any) -> Float64Array:
     smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     if smallest <= 0:
         raise InputError(
-            f"{name} is not positive definite: smallest eigenvalue {smallest:.3g}; "
+            f"{name} is not positive definite: smallest eigenvalue {smallest:.3g}, expected above 0; "
             "zeros do not mean unknown, give every direction a positive variance"
         )
     return 0.5 * (C + C.T)

@@ -47,7 +47,7 @@ class _Checked:
                 _check_number(name, value, f.default, limits)
             elif not isinstance(value, type(f.default)):
                 raise ConfigError(
-                    f"{name} is {value!r}: expected {_KINDS.get(type(f.default), type(f.default).__name__)}"
+                    f"{name} is {value!r:.100}: expected {_KINDS.get(type(f.default), type(f.default).__name__)}"
                 )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -35,8 +36,9 @@ class Matches:
 
 def match_features(source: View, target: View, start: Start) -> Matches:
     """RootSIFT features, mutual nearest neighbours that pass the ratio test (Lowe 2004; Arandjelovic 2012)."""
-    px_s, descriptors_s = _describe(source.rgb, start.max_features)
-    px_t, descriptors_t = _describe(target.rgb, start.max_features)
+    count = start.max_features
+    with ThreadPoolExecutor(2) as pool:
+        (px_s, descriptors_s), (px_t, descriptors_t) = pool.map(_describe, (source.rgb, target.rgb), (count, count))
     i, j = _mutual(descriptors_s, descriptors_t, start.match_ratio)
     return Matches(px_s[i], px_t[j], _points(source, px_s[i]), _points(target, px_t[j]))
 

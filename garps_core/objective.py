@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from garps_core.geometry import Array
+from garps_core.geometry import Array, skew
 
 CHUNK_PAIRS = 1 << 15
 """Pairs handled at a time: sixteen float32 planes of this size stay in a CPU core's second-level cache."""
@@ -36,7 +36,9 @@ NOTHING = -60.0
 """Logarithm of a density, relative to the floor, that is as good as none; smaller ones become slow subnormals."""
 SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Order of the six distinct elements of a symmetric 3x3 matrix."""
-_FULL = torch.tensor([0, 1, 2, 1, 3, 4, 2, 4, 5])
+_FULL = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_SKEW = np.stack([skew(axis) for axis in np.eye(3)])
+"""[mu]x = sum_k mu_k _SKEW[k]."""
 
 
 @dataclass(frozen=True)
@@ -76,37 +78,36 @@ class Evaluation:
 
 def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
-    rows = _row_sums(pairs, T)
-    s, U, Q, A, moved, rotated = rows
-    weights = pairs.weights.double()
-    if form == "log":
-        ratio = s
-        value = float((weights * torch.log1p(ratio)).sum())
-        c = weights / (1 + ratio)
-        support = float((weights * (ratio / (1 + ratio))).sum())
-    else:
-        total = (weights * s).sum()
-        value = float(torch.log(total)) if float(total) > 0 else -np.inf
-        c = weights / total.clamp_min(1e-300)
-        support = 1.0
-    return Evaluation(value, *_combine(c, U, Q, A, moved, rotated, weights if form == "log" else None), support)
-
-
-def _row_sums(pairs: Pairs, T: Array) -> tuple[Tensor, ...]:
-    """Per-row sums over partners of g, g u, g S^-1, g u u' (n, ...), then mu' and S' of the rows; float64."""
     like = pairs.means
-    R = torch.as_tensor(T[:3, :3], dtype=like.dtype, device=like.device)
-    t = torch.as_tensor(T[:3, 3], dtype=like.dtype, device=like.device)
-    moved = like @ R.T + t
-    rotated = R @ unpack(pairs.covariances) @ R.T
-    planes_S = pack(rotated).T.contiguous()
-    planes_mu = moved.T.contiguous()
-    n, k = len(like), pairs.log_weights.shape[0]
-    chunk = max(1, (CHUNK_PAIRS_CUDA if like.is_cuda else CHUNK_PAIRS) // max(k, 1))
-    parts = [_chunk_sums(pairs, planes_mu, planes_S, slice(b, b + chunk)) for b in range(0, n, chunk)]
-    sums = torch.cat(parts, dim=1).double()
-    s, U, Q, A = sums[0], sums[1:4].T, sums[4:10].T, sums[10:16].T
-    return s, U, unpack(Q), unpack(A), moved.double(), rotated.double()
+    R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3:]))
+    mu = torch.addmm(t, R, like.T)
+    S = torch.as_tensor(_packed_rotation(T[:3, :3]), dtype=like.dtype, device=like.device) @ pairs.covariances.T
+    sums = _row_sums(pairs, mu, S)
+    weights, s = pairs.weights.double(), sums[0]
+    if form == "log":
+        value = float((weights * torch.log1p(s)).sum())
+        c = weights / (1 + s)
+        return Evaluation(value, *_combine(c, sums, mu, S, weights), float((c * s).sum()))
+    total = (weights * s).sum()
+    value = float(torch.log(total)) if float(total) > 0 else -np.inf
+    return Evaluation(value, *_combine(weights / total.clamp_min(1e-300), sums, mu, S, None), 1.0)
+
+
+def _packed_rotation(R: Array) -> Array:
+    """6x6 matrix that takes a packed symmetric S to the packed R S R'."""
+    columns = []
+    for i, j in SYMMETRIC:
+        outer = np.outer(R[:, i], R[:, j])
+        columns.append(outer + outer.T if i != j else outer)
+    return np.stack([[column[i, j] for i, j in SYMMETRIC] for column in columns], axis=1)
+
+
+def _row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
+    """(16, n) float64 sums over each row's partners: g, g u (3), g S^-1 (6), g u u' (6), in units of the floor."""
+    n, k = len(pairs.means), pairs.log_weights.shape[0]
+    chunk = max(1, (CHUNK_PAIRS_CUDA if mu.is_cuda else CHUNK_PAIRS) // max(k, 1))
+    parts = [_chunk_sums(pairs, mu, S, slice(begin, begin + chunk)) for begin in range(0, n, chunk)]
+    return torch.cat(parts, dim=1).double()
 
 
 def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
@@ -136,26 +137,47 @@ def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
     return torch.stack([plane.sum(0) for plane in planes])
 
 
-def _combine(
-    c: Tensor, U: Tensor, Q: Tensor, A: Tensor, moved: Tensor, rotated: Tensor, weights: Tensor | None
-) -> tuple[Array, Array, Array]:
-    """Gradient, Gauss-Newton and observed information from row sums; c (n,) = d objective / d s_i."""
-    cU, cQ, cA = U * c[:, None], Q * c[:, None, None], A * c[:, None, None]
-    M = rotated @ (cA - cQ)
-    vee = torch.stack([M[:, 1, 2] - M[:, 2, 1], M[:, 2, 0] - M[:, 0, 2], M[:, 0, 1] - M[:, 1, 0]], dim=1)
-    gradient = torch.cat([-cU.sum(0), (vee - torch.linalg.cross(moved, cU)).sum(0)])
-    missing = cA.clone()
+def _combine(c: Tensor, sums: Tensor, mu: Tensor, S: Tensor, weights: Tensor | None) -> tuple[Array, Array, Array]:
+    """Gradient, Gauss-Newton and observed information from row sums; c (n,) = d objective / d s_i.
+
+    J' Q J is quadratic in mu', so it needs only the moments sum Q, sum mu' Q and sum mu' mu'' Q: two small products.
+    """
+    mu, scaled = mu.double(), sums[1:] * c
+    U, Q, A = scaled[:3], scaled[3:9], scaled[9:]
+    missing = A
     if weights is not None:
-        missing -= cU[:, :, None] * cU[:, None, :] / weights.clamp_min(1e-300)[:, None, None]
-    J = torch.zeros(len(moved), 3, 6, dtype=moved.dtype, device=moved.device)
-    J[:, range(3), range(3)] = 1
-    x, y, z = moved.unbind(1)
-    J[:, 0, 4], J[:, 0, 5], J[:, 1, 5] = z, -y, x  # -[mu']x
-    J[:, 1, 3], J[:, 2, 3], J[:, 2, 4] = -z, y, -x
-    flat = J.reshape(-1, 6)
-    information = flat.T @ (cQ @ J).reshape(-1, 6)
-    observed = information - flat.T @ (missing @ J).reshape(-1, 6)
-    return gradient.cpu().numpy(), information.cpu().numpy(), observed.cpu().numpy()
+        per_weight = 1 / weights.clamp_min(1e-300)
+        missing = A - torch.stack([U[i] * U[j] * per_weight for i, j in SYMMETRIC])
+    ones = torch.ones_like(mu[:1])
+    powers = torch.cat([ones, mu, torch.stack([mu[i] * mu[j] for i, j in SYMMETRIC])])
+    moments = (powers @ torch.cat([U, Q, missing]).T).cpu().numpy()
+    turning = (S.double() @ (A - Q).T).cpu().numpy()  # sum over rows of S'_ab (u u' - S^-1)_cd
+    information = _through_jacobian(moments[:, 3:9])
+    return _gradient(moments[:4, :3], turning), information, information - _through_jacobian(moments[:, 9:])
+
+
+def _gradient(moments: Array, turning: Array) -> Array:
+    """(-sum u, sum vee(S' (u u' - S^-1)) - mu' x u) from moments (4, 3) of u with (1, mu') and `turning` (6, 6)."""
+    product = np.einsum("abbc->ac", turning[_FULL[:, :, None, None], _FULL])  # S' (u u' - S^-1), 3x3
+    outer = moments[1:]  # sum mu' u'
+    return np.concatenate([-moments[0], _vee(product) - _vee(outer)])
+
+
+def _vee(M: Array) -> Array:
+    """(M12 - M21, M20 - M02, M01 - M10); of an outer product a b' this is a x b."""
+    return np.array([M[1, 2] - M[2, 1], M[2, 0] - M[0, 2], M[0, 1] - M[1, 0]])
+
+
+def _through_jacobian(moments: Array) -> Array:
+    """Sum of J' Q J (6, 6), J = [I, -[mu']x], from moments (10, 6) of the packed Q with (1, mu', mu' mu'')."""
+    full = moments[:, _FULL]  # (10, 3, 3)
+    first, second = full[1:4], full[4:][_FULL]
+    H = np.empty((6, 6))
+    H[:3, :3] = full[0]
+    H[:3, 3:] = -np.einsum("kab,kbc->ac", first, _SKEW)
+    H[3:, :3] = H[:3, 3:].T
+    H[3:, 3:] = np.einsum("kba,klbc,lcd->ad", _SKEW, second, _SKEW)
+    return H
 
 
 def pack(S: Tensor) -> Tensor:
@@ -165,4 +187,4 @@ def pack(S: Tensor) -> Tensor:
 
 def unpack(six: Tensor) -> Tensor:
     """(..., 6) -> symmetric (..., 3, 3)."""
-    return six[..., _FULL.to(six.device)].reshape(*six.shape[:-1], 3, 3)
+    return six[..., torch.as_tensor(_FULL, device=six.device)]

@@ -149,17 +149,17 @@ def _image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
 
 def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:
     """Half the squared Mahalanobis distance (k, n) of the colours, both with `variance` per channel."""
-    cost: Tensor = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
+    cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
     for channel in range(3):
         cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    return cost.mul(1 / (4 * variance))
+    return cost.mul_(0.25 / variance)
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:
     """log o_i: `floor` times what one partner of mean weight gives a row of the same covariance at distance zero."""
     a, b, c, e, f, i = (2 * covariances).double().unbind(-1)
     det = a * (e * i - f * f) - b * (b * i - c * f) + c * (b * f - c * e)
-    scale = np.log(max(floor, 1e-30)) + torch.log(partners.weights.double().mean())
+    scale = torch.log(partners.weights.double().mean() * max(floor, 1e-30))
     return (scale - 0.5 * torch.log(det.clamp_min(1e-60))).to(covariances.dtype)
 
 

@@ -19,7 +19,7 @@ from garps_core.systematic import MODES, depth_modes
 
 RELATIVE_STEP = 1e-3
 """Relative depth change by which the effect of a shared depth error is probed."""
-MODE_ROWS = 1000
+MODE_ROWS = 600
 """Rows per direction that probe the effect of shared depth errors."""
 OPEN_DIRECTION = 1e-3
 """Directions in which re-assigning partners cancels the curvature keep this share of it: a very large variance."""
@@ -71,16 +71,13 @@ def pose_covariance(solution: Solution, precision: Array, mode_sigmas: Array) ->
 
 
 def _gradient_per_mode(solution: Solution, view: str) -> Array:
-    """(6, m) change of the data gradient per unit of each depth mode of one view, by central differences."""
+    """(6, m) change of the data gradient per unit of each depth mode of one view, by finite differences."""
     few = tuple(_thinned(pairs) for pairs in solution.pairs or ())
-    columns = []
-    for mode in range(MODES):
-        ahead, behind = (
-            two_way(*_with_depth_error(few, view, mode, step), solution.T).gradient
-            for step in (RELATIVE_STEP, -RELATIVE_STEP)
-        )
-        columns.append((ahead - behind) / (2 * RELATIVE_STEP))
-    return np.stack(columns, axis=1)
+    here = two_way(few[0], few[1], solution.T).gradient
+    changed = [
+        two_way(*_with_depth_error(few, view, mode, RELATIVE_STEP), solution.T).gradient for mode in range(MODES)
+    ]
+    return np.stack([(gradient - here) / RELATIVE_STEP for gradient in changed], axis=1)
 
 
 def _thinned(pairs: Pairs) -> Pairs:
