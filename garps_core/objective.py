@@ -116,12 +116,23 @@ def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
     S = pairs.partner_covariances[:, :, rows]
     d0, d1, d2 = mu[0, rows] - y[0], mu[1, rows] - y[1], mu[2, rows] - y[2]
     a, b, c, e, f, i = (S_row[m, rows] + S[m] for m in range(6))
-    # inverse of [[a, b, c], [b, e, f], [c, f, i]] by cofactors
-    p0, p1, p2 = e * i - f * f, c * f - b * i, b * f - c * e
-    det = a * p0 + b * p1 + c * p2
-    r = det.reciprocal()
-    p3, p4, p5 = (a * i - c * c).mul_(r), (b * c - a * f).mul_(r), (a * e - b * b).mul_(r)
-    p0, p1, p2 = p0.mul_(r), p1.mul_(r), p2.mul_(r)
+    # inverse of [[a, b, c], [b, e, f], [c, f, i]] = L D L'; cofactors would lose long thin components in float32
+    left = torch.finfo(a.dtype).eps  # share of a variance that is taken to be left when rounding leaves less
+    r0 = a.reciprocal()
+    l1, l2 = b * r0, c * r0
+    second = torch.maximum(e - b * l1, e * left)
+    r1 = second.reciprocal()
+    f = f.addcmul_(c, l1, value=-1)
+    l3 = f * r1
+    third = torch.maximum((i - c * l2).addcmul_(f, l3, value=-1), i * left)
+    det = a * second * third
+    p5 = third.reciprocal_()
+    m = (l1 * l3).sub_(l2)
+    p4, p2 = -l3 * p5, m * p5
+    l1r = l1 * r1
+    p1 = (m * p4).sub_(l1r)
+    p0 = r0.addcmul_(l1, l1r).addcmul_(m, p2)
+    p3 = r1.addcmul_(l3, p4, value=-1)
     u0 = p0 * d0 + p1 * d1 + p2 * d2
     u1 = p1 * d0 + p3 * d1 + p4 * d2
     u2 = p2 * d0 + p4 * d1 + p5 * d2

@@ -107,7 +107,7 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
     log_weights = torch.log(partners.weights.clamp_min(1e-30))[chosen]
     log_weights = log_weights - _colour_cost(rows, partners, chosen, settings.colour_variance)
     if rows.labels is not None and partners.labels is not None:
-        differs = rows.labels[None] != partners.labels[chosen]
+        differs = (rows.labels[None] != partners.labels[chosen]).to(log_weights.dtype)
         log_weights = log_weights + differs * float(np.log(max(settings.semantic_discount, 1e-30)))
     log_weights = log_weights.masked_fill(settings.max_distance_m < distance.T, -torch.inf)
     scale = rung.covariance_scale
