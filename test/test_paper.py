@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The preset "paper" is the published method: its numbers, its objective and every step of its optimiser.
+
+The reference is written from the paper's eq. 5 and section 3.2 with automatic differentiation and torch's Adam; it
+shares no code with the package.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from surfaces import FREE, random_pose
+from torch.optim import Adam
+
+from garps_core import Config, Mixture, Prior, Status, align_mixtures, paper
+from garps_core.geometry import se3_inverse, transform
+from garps_core.pairing import to_cloud
+
+STEPS = 25
+PAPER = Config.preset("paper").replace({"dtype": "float64"})
+START = random_pose(4, 0.05)
+
+
+def opaque_mixture(seed, count=4500):
+    """Components as a network gives them: opacities 0..1 (about three quarters above a half), 20 classes."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(count, 3, 3)) * 0.02
+    return Mixture(
+        rng.uniform((-2, -1.5, 1), (2, 1.5, 6), (count, 3)),
+        A @ A.transpose(0, 2, 1) + 1e-4 * np.eye(3),
+        np.sqrt(rng.uniform(0, 1, count)),
+        rng.uniform(0, 1, (count, 3)),
+        rng.integers(0, 20, count),
+    )
+
+
+SOURCE, TARGET = opaque_mixture(1), opaque_mixture(2)
+
+
+def rotation(q):
+    """Quaternion (w, x, y, z) of any length -> 3x3, differentiable."""
+    w, x, y, z = q / q.norm()
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def quaternion(R):
+    """3x3 with a positive trace -> (w, x, y, z)."""
+    w = np.sqrt(1 + np.trace(R)) / 2
+    vector = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)
+    return torch.tensor([w, *vector], dtype=torch.float64)
+
+
+def matrix(q, t):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation(q).detach().numpy(), t.detach().numpy()
+    return T
+
+
+class Published:
+    """Eq. 5 over the candidate pairs of section 3.2: opacity, stride, nearest neighbours, distance."""
+
+    def __init__(self, source, target, T, neighbours=30):
+        mu_x, S_x, phi_x, c_x, l_x = self._salient(source)
+        mu_y, S_y, phi_y, c_y, l_y = self._salient(target)
+        distance = np.linalg.norm(transform(T, mu_x)[:, None] - mu_y[None], axis=-1)
+        nearest = np.argsort(distance, axis=1)[:, :neighbours]
+        i, j = np.repeat(np.arange(len(mu_x)), nearest.shape[1]), nearest.ravel()
+        near = distance[i, j] <= 2.5
+        i, j = i[near], j[near]
+        colour = ((c_x[i] - c_y[j]) ** 2 / (0.4 + 0.4)).sum(1)
+        weight = np.where(l_x[i] == l_y[j], 1, 0.92) * phi_x[i] * phi_y[j] * np.exp(-0.5 * colour)
+        parts = (mu_x[i], 90 * S_x[i], mu_y[j], 90 * S_y[j], weight)
+        self.mu, self.S, self.mu_y, self.S_y, self.weight = (torch.tensor(part) for part in parts)
+        self.pairs = len(i)
+
+    @staticmethod
+    def _salient(mixture):
+        kept = np.flatnonzero(mixture.weights >= 0.5)[::32]
+        phi = mixture.weights[kept] / np.abs(mixture.weights[kept]).sum()
+        return mixture.means[kept], mixture.covariances[kept], phi, mixture.colours[kept], mixture.labels[kept]
+
+    def value(self, q, t):
+        R = rotation(q)
+        d = self.mu @ R.T + t - self.mu_y
+        S = R @ self.S @ R.T + self.S_y
+        D = (d * torch.linalg.solve(S, d[..., None])[..., 0]).sum(-1)
+        return (self.weight * torch.linalg.det(S) ** -0.5 * torch.exp(-0.5 * D)).sum()
+
+    def path(self, T, steps):
+        """Poses and values of f on the way."""
+        q, t = quaternion(T[:3, :3]).requires_grad_(), torch.tensor(T[:3, 3]).requires_grad_()
+        optimiser = Adam([{"params": [q], "lr": 3e-6}, {"params": [t], "lr": 9e-5}])
+        poses, values = [matrix(q, t)], [self.value(q, t).item()]
+        for _ in range(steps):
+            optimiser.zero_grad()
+            (-self.value(q, t)).backward()
+            optimiser.step()
+            poses.append(matrix(q, t))
+            values.append(self.value(q, t).item())
+        return poses, values
+
+
+@pytest.fixture(scope="module")
+def published():
+    return Published(SOURCE, TARGET, START)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return paper.paper_pairs(to_cloud(SOURCE, PAPER), to_cloud(TARGET, PAPER), START, PAPER.alignment)
+
+
+def test_the_numbers_are_the_published_ones():
+    settings = PAPER.alignment
+    (rung,) = settings.ladder
+    assert (settings.semantic_discount, rung.covariance_scale, settings.colour_variance) == (0.92, 90, 0.4)
+    assert (settings.opacity_threshold, settings.component_stride) == (0.5, 32)
+    assert (rung.neighbours, settings.max_distance_m) == (30, 2.5)
+    assert (settings.adam_rate_translation, settings.adam_rate_rotation) == (9e-5, 3e-6)
+    assert settings.solver == "adam" and settings.depth_weight == 1 and PAPER.lifting.weighting == "equal"
+
+
+def test_candidate_pairs_are_the_published_ones(pairs, published):
+    kept = int(torch.isfinite(pairs.log_weights).sum())
+    assert kept == published.pairs
+    assert 0 < kept < 30 * len(pairs.means), "or the distance cut was not tried"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_value_and_gradient_are_those_of_the_published_objective(seed, pairs, published):
+    """Also at quaternions that are not of unit length: Adam does not keep them so."""
+    rng = np.random.default_rng(seed)
+    q = (quaternion(START[:3, :3]) * rng.uniform(0.5, 2) + torch.tensor(0.02 * rng.normal(size=4))).requires_grad_()
+    t = torch.tensor(START[:3, 3] + 0.02 * rng.normal(size=3)).requires_grad_()
+    f = published.value(q, t)
+    dq, dt = torch.autograd.grad(f, (q, t))
+    got_f, got_dq, got_dt = paper.value_and_gradient(pairs, q.detach().numpy(), t.detach().numpy())
+    assert got_f == pytest.approx(f.item(), rel=1e-11)
+    np.testing.assert_allclose(got_dq, dq, atol=1e-10 * float(dq.abs().max()))
+    np.testing.assert_allclose(got_dt, dt, atol=1e-10 * float(dt.abs().max()))
+
+
+def test_every_step_is_that_of_adam_on_the_published_objective(pairs, published):
+    expected, values = published.path(START, STEPS)
+    got = paper.adam_path(pairs, START, PAPER.alignment, STEPS)
+    assert len(got) == STEPS + 1
+    for step, (a, b) in enumerate(zip(got, expected, strict=True)):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10, err_msg=f"step {step}")
+    assert np.linalg.norm(expected[-1][:3, 3] - START[:3, 3]) > 5e-4, "or nothing moved"
+    assert (np.diff(values) > 0).all()
+
+
+def test_the_whole_estimate_ends_where_the_reference_does(published):
+    one_rung = (replace(PAPER.alignment.ladder[0], steps=STEPS),)
+    prior = Prior(START, FREE)
+    estimate = align_mixtures(SOURCE, TARGET, prior, PAPER.replace({"alignment.ladder": one_rung}))
+    expected, values = published.path(START, STEPS)
+    np.testing.assert_allclose(estimate.T_target_source, expected[-1], rtol=0, atol=1e-10)
+    assert np.exp(estimate.objective) == pytest.approx(values[-1], rel=1e-10)
+    assert estimate.status is Status.CONVERGED and estimate.iterations == STEPS
+
+
+def test_neighbours_leave_out_only_what_is_small(published):
+    """The sparse sum is the double sum less the pairs left out, all of them far in terms of their distance."""
+    full = Published(SOURCE, TARGET, START, neighbours=10_000)
+    q, t = quaternion(START[:3, :3]), torch.tensor(START[:3, 3])
+    sparse_f, full_f = published.value(q, t).item(), full.value(q, t).item()
+    assert full.pairs > 1.5 * published.pairs
+    assert 0.9 * full_f < sparse_f < full_f
+
+
+def test_the_threshold_counts_before_the_stride():
+    chosen = paper.salient(to_cloud(SOURCE, PAPER), PAPER.alignment)
+    kept = np.flatnonzero(SOURCE.weights >= 0.5)[::32]
+    np.testing.assert_array_equal(chosen.means.numpy(), SOURCE.means[kept])
+    assert chosen.weights.sum().item() == pytest.approx(1)
+
+
+def test_too_few_salient_components_are_no_pose_and_say_so():
+    faint = replace(SOURCE, weights=SOURCE.weights * 0.5)
+    estimate = align_mixtures(faint, TARGET, Prior(START, FREE), PAPER)
+    assert estimate.status is Status.LOW_OVERLAP and estimate.T_target_source is None
+    assert "fewer than 50 components" in estimate.reason
+
+
+def test_without_labels_every_pair_counts_in_full(pairs):
+    plain = [to_cloud(replace(mixture, labels=None), PAPER) for mixture in (SOURCE, TARGET)]
+    more = paper.paper_pairs(*plain, START, PAPER.alignment)
+    gain = (more.log_weights - pairs.log_weights)[torch.isfinite(pairs.log_weights)].numpy()
+    same = np.abs(gain) < 1e-12
+    np.testing.assert_allclose(gain[~same], -np.log(0.92), atol=1e-12)
+    assert 0 < same.sum() < 0.2 * len(gain)
+
+
+def test_the_start_is_where_the_path_starts(pairs):
+    np.testing.assert_allclose(paper.adam_path(pairs, START, PAPER.alignment, 0)[0], START)
+    back = se3_inverse(START)
+    assert not np.allclose(paper.adam_path(pairs, back, PAPER.alignment, 1)[1], START)
