@@ -14,7 +14,7 @@ UInt8 = npt.NDArray[np.uint8]
 
 WIDTH = 1400
 """Of the finished picture, pixels."""
-COLOURS = 160
+COLOURS = 256
 """A palette keeps the file below 400 kB."""
 MARGIN, CAPTION = 24, 40
 
