@@ -13,7 +13,7 @@ import torch
 
 from garps_core import paper, solve
 from garps_core.checks import Float64Array
-from garps_core.config import Alignment, Config
+from garps_core.config import Config
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import initialise
@@ -97,7 +97,9 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
     precision = np.asarray(np.linalg.inv(start_covariance), np.float64)
     covariance = pose_covariance(solution, precision, config.lifting.mode_sigmas())
-    status, reason = _verdict(solution, T0, precision, _relative_uncertainty(source, solution.T, covariance), settings)
+    status, reason = _verdict(
+        solution, initial, precision, _relative_uncertainty(source, solution.T, covariance), config
+    )
     return PoseEstimate(
         status,
         reason,
@@ -130,17 +132,26 @@ def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64A
 
 
 def _verdict(
-    solution: Solution, T0: Float64Array, precision: Float64Array, uncertainty: float, settings: Alignment
+    solution: Solution, initial: Prior, precision: Float64Array, uncertainty: float, config: Config
 ) -> tuple[Status, str]:
     """Status and reason of a solution, the gravest first."""
+    settings = config.alignment
     if settings.solver == "adam":
         return Status.CONVERGED, f"the paper's fixed number of steps, {solution.iterations}"
-    r = se3_log(solution.T @ se3_inverse(T0))
+    r = se3_log(solution.T @ se3_inverse(initial.T_target_source))
     distance = float(np.sqrt(r @ precision @ r))
     if distance > settings.max_prior_sigmas:
         return (
             Status.INCONSISTENT,
             f"the views pull {distance:.1f} sigmas away from the initial pose ({settings.max_prior_sigmas:g} allowed)",
+        )
+    support = solution.posterior.data.support
+    wanted = config.start.identity_support if initial.origin == "identity" else settings.min_support
+    if support < wanted:
+        return (
+            Status.POOR_FIT,
+            f"{support:.0%} of the components found a partner, expected {wanted:.0%} from the start {initial.origin!r}: "
+            "possibly a wrong optimum, give a prior",
         )
     if uncertainty > settings.max_uncertainty:
         return (

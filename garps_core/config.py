@@ -108,6 +108,9 @@ class Start(_Checked):
         1.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
     )
     identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
+    identity_support: float = setting(
+        0.8, "share of components that must find a partner when the start was a guess (identity)", low=0, high=1
+    )
     identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
     identity_sigma_rad: float = setting(0.2, "sigma of the identity start, rotation", unit="rad", low=1e-4, high=3)
 
@@ -132,11 +135,13 @@ class Alignment(_Checked):
         choices=("second_order", "adam"),
     )
     ladder: tuple[Rung, ...] = (
+        Rung(1000.0, 800, 20, 8),
+        Rung(300.0, 1000, 20, 8),
         Rung(100.0, 1500, 20, 8),
         Rung(30.0, 2000, 15, 8),
         Rung(10.0, 3000, 12, 8),
         Rung(4.0, 4000, 12, 8),
-        Rung(2.0, 8000, 12, 8),
+        Rung(2.0, 8000, 12, 20),
     )
     colour_variance: float = setting(0.02, "variance of each colour channel (0..1)", unit="", low=1e-4, high=100)
     semantic_discount: float = setting(0.92, "weight of a pair with different labels", unit="", low=0, high=1)
@@ -160,6 +165,9 @@ class Alignment(_Checked):
     min_overlap: float = setting(0.1, "smaller overlap is refused", unit="", low=0, high=1)
     max_prior_sigmas: float = setting(
         8.0, "a pose further than this from the initial one is called inconsistent", unit="sigma", low=1, high=1e6
+    )
+    min_support: float = setting(
+        0.35, "smallest share of components that must find a partner under the final pose", low=0, high=1
     )
     max_uncertainty: float = setting(
         0.05,
@@ -239,7 +247,7 @@ def _monocular() -> Config:
     return Config(
         lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, scale_sigma=0.03, warp_sigma=0.02),
         alignment=Alignment(
-            ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 8)),
+            ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 20)),
             colour_variance=0.01,
             depth_weight=0.2,
             information=3.0,

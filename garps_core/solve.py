@@ -22,8 +22,8 @@ from garps_core.pairing import Cloud, pair_up, thin, visible
 MIN_ROWS = 50
 SMALLEST_CURVATURE = 0.1
 """Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
-ENTRY_WIDTH = 2.0
-"""A rung is skipped when the next one's kernels are still this many times wider than the start's uncertainty."""
+ENTRY_WIDTH = 0.7
+"""A rung is skipped when the next one's kernels are still wider than this many times the start's uncertainty."""
 
 
 @dataclass(frozen=True)
