@@ -24,6 +24,13 @@ from garps_core.types import Prior, View
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RGBD_SETS = ("hololens_lounge", "tum_fr1_rpy")
+TRUTH_REACH = {
+    ("hololens_lounge", "small"): (0.010, 0.3),
+    ("hololens_lounge", "large"): (0.025, 0.4),
+    ("tum_fr1_rpy", "small"): (0.017, 0.7),
+    ("tum_fr1_rpy", "large"): (0.017, 0.7),
+}
+"""How far each set's own truth can be trusted, m and deg (the sets' README); generated pairs are exact."""
 DISTURBANCE_M = 0.12
 DISTURBANCE_DEG = 1.0
 
@@ -48,6 +55,12 @@ class Pair:
     target: View
     T_target_source: Float64Array
     points: Float64Array
+
+
+def truth_covariance(pair: Pair) -> Float64Array:
+    """6x6 covariance (ROS meaning) of the truth itself, its reach spread evenly over the axes; zero when exact."""
+    metres, degrees = TRUTH_REACH.get((pair.set, pair.category), (0.0, 0.0))
+    return np.diag([metres**2 / 3] * 3 + [np.radians(degrees) ** 2 / 3] * 3)
 
 
 def rng_of(name: str, seed: int = 0) -> np.random.Generator:

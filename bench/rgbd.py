@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy on real RGB-D pairs: GARPS against its start and against its peers, from the same starts, in one run.
 
+    python -m bench.rgbd
+    python -m bench.rgbd --monocular
     python -m bench.rgbd --sets hololens_lounge --starts disturbed --methods garps,small-gicp
 
 Rows (one per pair, start and method) go to rows.csv and run.json, tables to table.md; `summarise` needs only rows.
@@ -9,6 +11,7 @@ Rows (one per pair, start and method) go to rows.csv and run.json, tables to tab
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -19,13 +22,16 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from bench.baselines import METHODS, NEED_NO_START
-from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, with_monocular_depth
+from bench.baselines import METHODS
+from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, truth_covariance, with_monocular_depth
 from bench.tables import Row, machine_facts, print_tables, summarise, write
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 
 GARPS, START = "garps", "(start)"
+TABLE_WIDTH = 170
+"""Columns of a table that goes to a file or a pipe."""
+PEERS = ("open3d-gicp", "open3d-colored", "small-gicp", "sift-pnp")
 STARTS = ("features", "disturbed", "identity")
 
 
@@ -118,7 +124,10 @@ def _row(
         "T": T[:3].ravel().tolist(),
     }
     if covariance is not None:
-        row |= {"nees": metrics.nees(T, covariance, truth), "covariance": np.asarray(covariance).ravel().tolist()}
+        row |= {
+            "nees": metrics.nees(T, covariance + truth_covariance(pair), truth),
+            "covariance": np.asarray(covariance).ravel().tolist(),
+        }
     return row
 
 
@@ -134,26 +143,26 @@ def main(
     methods: Annotated[str, typer.Option(help=f"comma-separated from garps, {', '.join(METHODS)}")] = "",
     monocular: Annotated[bool, typer.Option(help="spoil the depth as a metric monocular network would")] = False,
     limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, spread evenly")] = None,
-    full: Annotated[bool, typer.Option(help="all starts and all methods unless given")] = False,
+    full: Annotated[bool, typer.Option(help="all peers unless given")] = False,
     change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
     data: Annotated[Path, typer.Option(help="folder that holds dev/<set>/pairs.json")] = DATA,
     out: Annotated[Path, typer.Option(help="where rows and tables go")] = Path("out/rgbd"),
     seed: Annotated[int, typer.Option(help="of disturbances and spoilt depth")] = 0,
 ) -> None:
     """Accuracy on real RGB-D pairs."""
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
     names = sets.split(",") if sets else available(data)
     if not names:
         console.print(f"no data under {data / 'dev'}: give its folder with --data")
         raise typer.Exit(2)
-    default_starts, default_methods = (STARTS, (GARPS, *METHODS)) if full else (STARTS[:2], (GARPS, *NEED_NO_START))
+    default_methods = (GARPS, *METHODS) if full else (GARPS, *PEERS)
     config, rows = _settings(preset, change or [], monocular), []
     facts = {"depth": "monocular-like" if monocular else "sensor", "seed": seed, **machine_facts()}
     for name in names:
         pairs = load_pairs(name, data, limit)
         if monocular:
             pairs = [with_monocular_depth(pair, seed) for pair in pairs]
-        for start in starts.split(",") if starts else default_starts:
+        for start in starts.split(",") if starts else STARTS:
             chosen = methods.split(",") if methods else list(default_methods)
             # Compiles, so that no pair's time holds it.
             run_garps(config, pairs[0], "disturbed", disturbed_prior(pairs[0]))

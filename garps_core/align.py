@@ -150,8 +150,8 @@ def _verdict(
     if support < wanted:
         return (
             Status.POOR_FIT,
-            f"{support:.0%} of the components found a partner, expected {wanted:.0%} from the start {initial.origin!r}: "
-            "possibly a wrong optimum, give a prior",
+            f"{support:.0%} of the components found a partner, expected {wanted:.0%} after a start "
+            f"from {initial.origin}: possibly a wrong optimum, give a prior",
         )
     if uncertainty > settings.max_uncertainty:
         return (
