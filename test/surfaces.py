@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
+import pytest
 import torch
 
 from garps_core import Config, Mixture, Prior, View, reconstruct
@@ -111,3 +113,11 @@ def off(a, b):
     D = a @ se3_inverse(b)
     angle = np.arcsin(min(1.0, np.linalg.norm(D[:3, :3] - D[:3, :3].T) / np.sqrt(8)))
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(angle)
+
+
+@lru_cache(maxsize=8)
+def room(seed, level, depth_noise="none"):
+    """Source view, target view and true pose in a rendered room; the test is skipped where nothing can render."""
+    pytest.importorskip("embreex")
+    made = pytest.importorskip("bench.rooms").make_pair(seed, level, width=320, height=240, depth_noise=depth_noise)
+    return View(made.rgb0, made.K0, made.depth0), View(made.rgb1, made.K1, made.depth1), made.T_1_0

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The initial pose: features and metric PnP where there is texture, and an honest fallback where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from surfaces import FREE, TRUTH, disturbed, flat, grey_at, look, room
+
+from garps_core import Config, Prior, Status, View, estimate_relative_pose
+from garps_core.config import Start
+from garps_core.errors import InitialisationError
+from garps_core.features import Matches, match_features
+from garps_core.geometry import pixel_rays, project, se3_inverse, transform
+from garps_core.initialise import initialise
+from garps_core.metrics import nees, rotation_error_deg, translation_error_m
+from garps_core.pnp import pose_from_matches
+from garps_core.uncertainty import inverted
+
+FEATURES = Config().replace({"start.method": "features"})
+STRICT = Config().replace({"start.identity_fallback": False})
+HD = (240, 320)
+CAMERA = np.array([[280.0, 0, 159.5], [0, 280.0, 119.5], [0, 0, 1]])
+BLANK = look(surface=flat, colours=grey_at, camera=CAMERA, size=HD)
+
+
+def exact_matches(seed=0, count=80, pixel_noise=0.0, outliers=0, relative_depth_noise=0.0, truth=TRUTH):
+    """Points 2 to 5 m away, matched between two cameras without an image."""
+    rng = np.random.default_rng(seed)
+    px_s = rng.uniform((40, 30), (280, 210), (count, 2))
+    points = pixel_rays(CAMERA, px_s[:, 0], px_s[:, 1]) * rng.uniform(2, 5, (count, 1))
+    there = transform(truth, points)
+    px_t = project(CAMERA, there)
+    px_t[:outliers] = rng.uniform((0, 0), (319, 239), (outliers, 2))
+    there[:outliers] = pixel_rays(CAMERA, *px_t[:outliers].T) * rng.uniform(2, 5, (outliers, 1))
+    gains = 1 + relative_depth_noise * rng.normal(size=(2, count, 1))
+    shift = pixel_noise * rng.normal(size=(2, count, 2))
+    return Matches(px_s + shift[0], px_t + shift[1], points * gains[0], there * gains[1])
+
+
+def pose_from(matches, config=None):
+    return pose_from_matches(matches, BLANK, BLANK, config or Config())
+
+
+@pytest.mark.parametrize(("seed", "level"), [(1, 1), (1, 2), (2, 1), (2, 2)])
+def test_features_start_close_in_a_textured_room(seed, level):
+    source, target, truth = room(seed, level)
+    start = initialise(source, target)
+    assert start.origin == "features" and "inliers" in start.reason
+    assert translation_error_m(start.T_target_source, truth) < 0.02
+    assert rotation_error_deg(start.T_target_source, truth) < 0.5
+    assert nees(start.T_target_source, start.covariance, truth) < 25
+    sigmas = np.sqrt(np.diag(start.covariance))
+    assert (sigmas < [0.1] * 3 + [0.03] * 3).all() and (sigmas > 1e-4).all()
+
+
+def test_swapped_views_start_at_the_inverse():
+    source, target, _ = room(1, 1)
+    there, back = initialise(source, target), initialise(target, source)
+    sigmas = np.sqrt(np.diag(there.covariance))
+    again = se3_inverse(back.T_target_source)
+    assert translation_error_m(again, there.T_target_source) < 2 * sigmas[:3].max()
+    assert np.radians(rotation_error_deg(again, there.T_target_source)) < 2 * sigmas[3:].max()
+    ratio = np.diag(inverted(back.covariance, back.T_target_source)) / np.diag(there.covariance)
+    assert ((ratio > 1 / 4) & (ratio < 4)).all()
+
+
+@pytest.mark.parametrize("without", ["source", "target"])
+def test_depth_of_one_view_is_enough(without):
+    """Then one direction alone makes the pose: the other view's pixels against this one's points."""
+    source, target, truth = room(1, 1)
+    views = {"source": source, "target": target}
+    views[without] = replace(views[without], depth=None)
+    start = initialise(views["source"], views["target"], FEATURES)
+    assert translation_error_m(start.T_target_source, truth) < 0.03
+    assert rotation_error_deg(start.T_target_source, truth) < 0.7
+
+
+def test_both_directions_are_more_certain_than_one():
+    matches = exact_matches(pixel_noise=0.5)
+    nothing = np.full_like(matches.source_points, np.nan)
+    both = pose_from(matches)
+    one = pose_from(replace(matches, target_points=nothing))
+    other = pose_from(replace(matches, source_points=nothing))
+    for single in (one, other):
+        assert translation_error_m(single.T_target_source, TRUTH) < 0.05
+        assert not np.allclose(single.T_target_source, both.T_target_source, atol=1e-6)
+    assert np.trace(both.covariance[:3, :3]) < np.trace(one.covariance[:3, :3]) * 1.05
+
+
+def test_exact_matches_give_the_exact_pose():
+    start = pose_from(exact_matches())
+    np.testing.assert_allclose(start.T_target_source, TRUTH, atol=1e-6)
+    assert start.reason == "80 feature matches, 80 inliers"
+
+
+@pytest.mark.parametrize("outliers", [20, 45])
+def test_wrong_matches_are_left_out(outliers):
+    start = pose_from(exact_matches(outliers=outliers))
+    assert translation_error_m(start.T_target_source, TRUTH) < 5e-3
+    assert rotation_error_deg(start.T_target_source, TRUTH) < 0.1
+    assert start.reason.startswith("80 feature matches")
+
+
+def test_covariance_of_the_start_covers_its_errors():
+    """Forty draws of pixel and depth noise, none of it shared: the claimed sigmas may be too large, not too small."""
+    config = Config().replace({"lifting.noise_floor_m": 0.0, "lifting.noise_linear": 0.01})
+    values = []
+    for seed in range(40):
+        start = pose_from(exact_matches(seed, pixel_noise=0.7, relative_depth_noise=0.01), config)
+        values.append(nees(start.T_target_source, start.covariance, TRUTH))
+    assert 0.3 < np.mean(values) < 6
+
+
+def test_noisier_depth_makes_the_start_less_certain():
+    """What is said of the depth counts, whether it is true or not."""
+    matches = exact_matches(pixel_noise=0.5)
+    sensor, network = pose_from(matches), pose_from(matches, Config.preset("monocular"))
+    assert np.trace(network.covariance[:3, :3]) > 2 * np.trace(sensor.covariance[:3, :3])
+    doubled = pose_from(matches, Config().replace({"start.covariance_inflation": 15.0, "lifting.scale_sigma": 0.0}))
+    assert np.trace(doubled.covariance) > 10 * np.trace(sensor.covariance)
+
+
+FAILURES = {
+    "no matches": (exact_matches(count=0), "0 feature matches, 0 with depth: no pose fits them"),
+    "too few": (exact_matches(count=11), "11 feature matches, 11 with depth: no pose fits them"),
+    "nothing but outliers": (
+        exact_matches(count=40, outliers=40),
+        r"40 feature matches, \d+ fit one pose: expected at",
+    ),
+    "no depth": (
+        replace(exact_matches(), source_points=np.full((80, 3), np.nan), target_points=np.full((80, 3), np.nan)),
+        "80 feature matches, 0 with depth: no pose fits them",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_matches_that_fit_no_pose_are_no_pose(name):
+    matches, text = FAILURES[name]
+    with pytest.raises(InitialisationError, match=text):
+        pose_from(matches)
+
+
+def test_blank_images_start_at_identity_and_say_why():
+    start = initialise(BLANK, BLANK)
+    assert start.origin == "identity" and start.reason.startswith("features failed: 0 feature matches")
+    np.testing.assert_array_equal(start.T_target_source, np.eye(4))
+    np.testing.assert_allclose(np.sqrt(np.diag(start.covariance)), [0.3] * 3 + [0.2] * 3)
+
+
+@pytest.mark.parametrize("config", [FEATURES, STRICT], ids=["method features", "no fallback"])
+def test_blank_images_without_a_fallback_have_no_initial_pose(config):
+    with pytest.raises(InitialisationError, match="0 feature matches, 0 with depth: no pose fits them"):
+        initialise(BLANK, BLANK, config)
+    estimate = estimate_relative_pose(BLANK, BLANK, config)
+    assert estimate.status is Status.NO_INITIAL_POSE and not estimate.ok
+    assert estimate.T_target_source is None and estimate.covariance is None and estimate.initial is None
+    assert estimate.reason.startswith("0 feature matches") and set(estimate.seconds) == {"reconstruct"}
+
+
+def test_one_blank_view_is_no_match():
+    source, _, _ = room(1, 1)
+    assert len(match_features(source, BLANK, Start())) == len(match_features(BLANK, source, Start())) == 0
+    assert initialise(source, BLANK).origin == "identity"
+
+
+def test_a_given_prior_is_used_as_it_is():
+    prior = disturbed()
+    assert initialise(BLANK, BLANK, Config(), prior) is prior
+    assert initialise(BLANK, BLANK, STRICT, prior) is prior
+
+
+def test_methods_that_are_asked_for_ignore_a_prior():
+    wide = Config().replace({"start.method": "identity", "start.identity_sigma_m": 2.0})
+    start = initialise(BLANK, BLANK, wide, disturbed())
+    assert start.origin == "identity" and "asked for" in start.reason
+    np.testing.assert_array_equal(start.T_target_source, np.eye(4))
+    assert start.covariance[0, 0] == pytest.approx(4)
+    with pytest.raises(InitialisationError):
+        initialise(BLANK, BLANK, FEATURES, disturbed())
+    source, target, truth = room(1, 1)
+    wrong = Prior(np.eye(4), 1e-6 * FREE)
+    assert translation_error_m(initialise(source, target, FEATURES, wrong).T_target_source, truth) < 0.02
+
+
+def test_matches_carry_the_depth_of_their_pixels():
+    source, target, truth = room(1, 1)
+    matches = match_features(source, target, Start())
+    assert len(matches) > 50
+    trusted = np.isfinite(matches.source_points[:, 0])
+    assert 0.3 < trusted.mean() <= 1
+    points, px = matches.source_points[trusted], matches.source_px[trusted]
+    np.testing.assert_allclose(project(source.K, points), px, atol=1e-6)
+    row, column = np.rint(px).astype(int).T[::-1]
+    assert np.median(np.abs(points[:, 2] / source.depth[row, column] - 1)) < 0.005
+    error = np.linalg.norm(project(target.K, transform(truth, points)) - matches.target_px[trusted], axis=1)
+    assert np.median(error) < 1.5
+    assert len(np.unique(matches.target_px, axis=0)) > 0.8 * len(matches), (
+        "mutual, but for features of two orientations"
+    )
+
+
+def test_depth_on_a_silhouette_is_not_trusted():
+    """A step in depth through the middle of the texture: matches beside it have a point, those on it have none."""
+    view = room(1, 1)[0]
+    step = np.where(np.arange(320) < 160, 2.0, 3.0).astype(np.float32) * np.ones((240, 1), np.float32)
+    stepped = View(view.rgb, view.K, step)
+    matches = match_features(stepped, stepped, Start())
+    away = np.abs(matches.source_px[:, 0] - 159.5)
+    trusted = np.isfinite(matches.source_points[:, 0])
+    assert trusted[away > 4].all() and not trusted[away < 1.5].any() and (away < 1.5).any()
+
+
+def test_the_same_seed_gives_the_same_start():
+    source, target, _ = room(1, 2)
+    a, b = initialise(source, target), initialise(source, target)
+    assert a.T_target_source.tobytes() == b.T_target_source.tobytes()
+    assert a.covariance.tobytes() == b.covariance.tobytes()
