@@ -17,7 +17,7 @@ from bench.rooms import RoomPair, make_pair
 from garps_core import Prior, Status, View, estimate_relative_pose, metrics
 
 ROOMS, LEVEL = (1, 3, 5), 2
-SIZES = ((0.1, 0.0), (0.2, 0.0), (0.3, 0.0), (0.0, 2.0), (0.0, 4.0), (0.0, 6.0), (0.0, 8.0), (0.2, 6.0))
+SIZES = ((0.2, 0.0), (0.4, 0.0), (0.6, 0.0), (0.0, 5.0), (0.0, 10.0), (0.0, 15.0), (0.2, 6.0), (0.4, 12.0))
 """Metres and degrees that the given pose is off, about the source camera."""
 REPEATS = 3
 RIGHT_M, RIGHT_DEG = 0.02, 0.5
