@@ -11,7 +11,7 @@ from garps_core import Config, Prior, Status, View, estimate_relative_pose
 from garps_core.config import Start
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches, match_features
-from garps_core.geometry import pixel_rays, project, se3_inverse, transform
+from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, transform
 from garps_core.initialise import initialise
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
 from garps_core.pnp import pose_from_matches
@@ -21,6 +21,11 @@ FEATURES = Config().replace({"start.method": "features"})
 STRICT = Config().replace({"start.identity_fallback": False})
 HD = (240, 320)
 CAMERA = np.array([[280.0, 0, 159.5], [0, 280.0, 119.5], [0, 0, 1]])
+APART = (
+    se3_exp(np.array([0, 0, 3.5, 0, 0, 0]))
+    @ se3_exp(np.array([0, 0, 0, 0.1, 0.7, 0]))
+    @ se3_exp(np.array([0, 0, -3.5, 0, 0, 0]))
+)  # turned about a point in the scene, so that position and rotation go together
 BLANK = look(surface=flat, colours=grey_at, camera=CAMERA, size=HD)
 
 
@@ -102,14 +107,16 @@ def test_wrong_matches_are_left_out(outliers):
     assert start.reason.startswith("80 feature matches")
 
 
-def test_covariance_of_the_start_covers_its_errors():
-    """Forty draws of pixel and depth noise, none of it shared: the claimed sigmas may be too large, not too small."""
-    config = Config().replace({"lifting.noise_floor_m": 0.0, "lifting.noise_linear": 0.01})
+@pytest.mark.parametrize("truth", [TRUTH, APART], ids=["beside", "two metres apart"])
+def test_covariance_of_the_start_covers_its_errors(truth):
+    """Forty draws of pixel and depth noise, none of it shared."""
+    own = {"lifting.noise_floor_m": 0.0, "lifting.noise_linear": 0.01}
+    config = Config().replace({**own, "lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0})
     values = []
     for seed in range(40):
-        start = pose_from(exact_matches(seed, pixel_noise=0.7, relative_depth_noise=0.01), config)
-        values.append(nees(start.T_target_source, start.covariance, TRUTH))
-    assert 0.3 < np.mean(values) < 6
+        start = pose_from(exact_matches(seed, pixel_noise=0.7, relative_depth_noise=0.01, truth=truth), config)
+        values.append(nees(start.T_target_source, start.covariance, truth))
+    assert 0.8 < np.mean(values) < 2.2, "6, over 1.5 squared for the inflation and 2 for counting matches both ways"
 
 
 def test_noisier_depth_makes_the_start_less_certain():
