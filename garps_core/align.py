@@ -13,7 +13,7 @@ import torch
 
 from garps_core import paper, solve
 from garps_core.checks import Float64Array
-from garps_core.config import Config
+from garps_core.config import Alignment, Config
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import initialise
@@ -96,9 +96,14 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
             reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
         return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
     precision = np.asarray(np.linalg.inv(start_covariance), np.float64)
-    covariance = pose_covariance(solution, precision, config.lifting.mode_sigmas())
+    covariance = pose_covariance(solution, precision, config.lifting)
+    guess = _relative_uncertainty(source, T0, initial.covariance) > settings.guess_uncertainty
     status, reason = _verdict(
-        solution, initial, precision, _relative_uncertainty(source, solution.T, covariance), config
+        solution,
+        initial,
+        settings.guess_support if guess else settings.min_support,
+        _relative_uncertainty(source, solution.T, covariance),
+        settings,
     )
     return PoseEstimate(
         status,
@@ -108,7 +113,7 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         initial,
         shared,
         solution.iterations,
-        solution.posterior.data.value,
+        solution.data.value,
     )
 
 
@@ -132,26 +137,25 @@ def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64A
 
 
 def _verdict(
-    solution: Solution, initial: Prior, precision: Float64Array, uncertainty: float, config: Config
+    solution: Solution, initial: Prior, wanted_support: float, uncertainty: float, settings: Alignment
 ) -> tuple[Status, str]:
     """Status and reason of a solution, the gravest first."""
-    settings = config.alignment
     if settings.solver == "adam":
         return Status.CONVERGED, f"the paper's fixed number of steps, {solution.iterations}"
-    r = se3_log(solution.T @ se3_inverse(initial.T_target_source))
-    distance = float(np.sqrt(r @ precision @ r))
+    T0 = initial.T_target_source
+    r = se3_log(solution.T @ se3_inverse(T0))
+    distance = float(np.sqrt(r @ np.linalg.solve(twist_from_ros(initial.covariance, T0), r)))
     if distance > settings.max_prior_sigmas:
         return (
             Status.INCONSISTENT,
             f"the views pull {distance:.1f} sigmas away from the initial pose ({settings.max_prior_sigmas:g} allowed)",
         )
-    support = solution.posterior.data.support
-    wanted = config.start.identity_support if initial.origin == "identity" else settings.min_support
-    if support < wanted:
+    support = solution.data.support
+    if support < wanted_support:
         return (
             Status.POOR_FIT,
-            f"{support:.0%} of the components found a partner, expected {wanted:.0%} after a start "
-            f"from {initial.origin}: possibly a wrong optimum, give a prior",
+            f"{support:.0%} of the components found a partner, expected {wanted_support:.0%} after this start "
+            f"({initial.origin}): possibly a wrong optimum, give a better prior",
         )
     if uncertainty > settings.max_uncertainty:
         return (

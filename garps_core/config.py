@@ -12,9 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from garps_core.errors import ConfigError
 
 
@@ -72,6 +69,9 @@ class Lifting(_Checked):
     )
     scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
     warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
+    pointing_sigma_rad: float = setting(
+        5e-4, "error of the direction a pixel looks in (0.25 px at a focal length of 500 px)", unit="rad", low=0, high=1
+    )
     edge_ratio: float = setting(
         0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
     )
@@ -86,10 +86,6 @@ class Lifting(_Checked):
         "area", "component weights: surface area seen, or one per pixel", choices=("area", "equal")
     )
 
-    def mode_sigmas(self) -> npt.NDArray[np.float64]:
-        """Sigmas (6,) of the depth modes of `systematic.py`: scale, then five of warp."""
-        return np.array([self.scale_sigma] + [self.warp_sigma] * 5)
-
 
 @dataclass(frozen=True)
 class Start(_Checked):
@@ -103,14 +99,11 @@ class Start(_Checked):
     max_features: int = setting(2000, "SIFT features per image", low=50, high=20000)
     match_ratio: float = setting(0.8, "ratio test of the feature matches", unit="", low=0.1, high=1)
     ransac_px: float = setting(3.0, "inlier threshold of the pose estimate", unit="px", low=0.1, high=50)
-    min_inliers: int = setting(12, "fewer inliers than this is no pose", low=4, high=10000)
+    min_inliers: int = setting(8, "fewer inliers than this is no pose", low=4, high=10000)
     covariance_inflation: float = setting(
         1.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
     )
     identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
-    identity_support: float = setting(
-        0.8, "share of components that must find a partner when the start was a guess (identity)", low=0, high=1
-    )
     identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
     identity_sigma_rad: float = setting(0.2, "sigma of the identity start, rotation", unit="rad", low=1e-4, high=3)
 
@@ -168,6 +161,12 @@ class Alignment(_Checked):
     )
     min_support: float = setting(
         0.35, "smallest share of components that must find a partner under the final pose", low=0, high=1
+    )
+    guess_uncertainty: float = setting(
+        0.1, "a start that leaves scene points uncertain by this share of their range is a guess", low=0, high=1e6
+    )
+    guess_support: float = setting(
+        0.8, "smallest share of components that must find a partner when the start was a guess", low=0, high=1
     )
     max_uncertainty: float = setting(
         0.05,

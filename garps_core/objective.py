@@ -78,10 +78,7 @@ class Evaluation:
 
 def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
-    like = pairs.means
-    R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3:]))
-    mu = torch.addmm(t, R, like.T)
-    S = torch.as_tensor(_packed_rotation(T[:3, :3]), dtype=like.dtype, device=like.device) @ pairs.covariances.T
+    mu, S = _moved(pairs, T)
     sums = _row_sums(pairs, mu, S)
     weights, s = pairs.weights.double(), sums[0]
     if form == "log":
@@ -91,6 +88,22 @@ def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     total = (weights * s).sum()
     value = float(torch.log(total)) if float(total) > 0 else -np.inf
     return Evaluation(value, *_combine(weights / total.clamp_min(1e-300), sums, mu, S, None), 1.0)
+
+
+def row_information(pairs: Pairs, T: Array) -> tuple[Array, Array]:
+    """What each row of the "log" objective measures: (n, 3, 3) sum of r_ij S^-1 times its weight, and (n, 3) mu'."""
+    mu, S = _moved(pairs, T)
+    sums = _row_sums(pairs, mu, S)
+    Q = sums[4:10] * (pairs.weights.double() / (1 + sums[0]))
+    return unpack(Q.T).cpu().numpy(), mu.T.double().cpu().numpy()
+
+
+def _moved(pairs: Pairs, T: Array) -> tuple[Tensor, Tensor]:
+    """Means (3, n) and packed covariances (6, n) of the rows moved by T."""
+    like = pairs.means
+    R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3:]))
+    turn = torch.as_tensor(_packed_rotation(T[:3, :3]), dtype=like.dtype, device=like.device)
+    return torch.addmm(t, R, like.T), turn @ pairs.covariances.T
 
 
 def _packed_rotation(R: Array) -> Array:

@@ -84,4 +84,4 @@ def maximise(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, se
     weight = settings.information * rung.covariance_scale
     precision = np.asarray(np.linalg.inv(covariance), np.float64)
     end = posterior(evaluate(pairs, T, "sum"), T, T_prior, precision, weight)
-    return Solution(T, end, rung.steps, True, None, weight)
+    return Solution(T, end, rung.steps, True, weight, end.data)

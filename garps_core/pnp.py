@@ -20,7 +20,7 @@ from garps_core.errors import InitialisationError
 from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, project, se3_exp, se3_inverse, skew, transform
 from garps_core.reconstruct import depth_sigma
-from garps_core.systematic import depth_modes
+from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
 
@@ -100,8 +100,10 @@ class _Normal:
 
     H: Array
     b: Array
-    shared: Array
-    """(6, m) d b / d (depth mode), one column per mode a whole depth map may share."""
+    from_points: Array
+    """(6, 8) d b per unit of each error that the view which measured the points may share (`systematic.py`)."""
+    from_pixels: Array
+    """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
     residual_px: Array
 
 
@@ -120,8 +122,11 @@ def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Liftin
     size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
     W = W * np.minimum(1.0, HUBER / size)[:, None, None]
     JW = J.transpose(0, 2, 1) @ W
-    modes = depth_modes(way.points)
-    return _Normal((JW @ J).sum(0), (JW @ residual[..., None])[..., 0].sum(0), (JW @ along)[..., 0].T @ modes, residual)
+    fields = D @ (T[:3, :3] @ shared_errors(way.points))
+    pointing = np.zeros((2, 8))
+    pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
+    b = (JW @ residual[..., None])[..., 0].sum(0)
+    return _Normal((JW @ J).sum(0), b, (JW @ fields).sum(0), JW.sum(0) @ pointing, residual)
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
@@ -137,8 +142,8 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     H = f.H + A.T @ b.H @ A + 1e-9 * np.eye(6)
     # both directions use the same matches: their pixel noise is one noise, counted twice in H
     covariance = 2.0 * np.linalg.inv(H) * config.start.covariance_inflation**2
-    for shared in (f.shared, A.T @ b.shared):
-        effect = np.linalg.solve(H, shared) * config.lifting.mode_sigmas()
+    for shared in (f.from_points + A.T @ b.from_pixels, f.from_pixels + A.T @ b.from_points):  # source, target
+        effect = np.linalg.solve(H, shared) * shared_sigmas(config.lifting)
         covariance += effect @ effect.T
     return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 

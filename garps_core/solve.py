@@ -10,7 +10,7 @@ pose. Lambda_0 is the inverse covariance of the initial pose, converted to the l
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from garps_core.pairing import Cloud, pair_up, thin, visible
 MIN_ROWS = 50
 SMALLEST_CURVATURE = 0.1
 """Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
+FINAL_ROWS, FINAL_NEIGHBOURS, FINAL_DENSITY = 800, 50, 2.0
+"""Pairs on which covariance and verdict rest: with few or sparse partners, cut-off kernels look like information."""
 ENTRY_WIDTH = 0.7
 """A rung is skipped when the next one's kernels are still wider than this many times the start's uncertainty."""
 
@@ -44,10 +46,12 @@ class Solution:
     posterior: Posterior
     iterations: int
     converged: bool
-    pairs: tuple[Pairs, Pairs] | None
-    """Source rows to target partners, and target rows to source partners, of the last rung; None for the paper's."""
     weight: float
     """What the data term was multiplied with: effective number of independent measurements of the last rung."""
+    data: Evaluation
+    """The data term at T, for the covariance and the verdict."""
+    pairs: tuple[Pairs, Pairs] | None = None
+    """What `data` was evaluated on: source rows to target partners, and target rows to source partners."""
 
 
 def two_way(forward: Pairs, backward: Pairs, T: Array) -> Evaluation:
@@ -74,14 +78,15 @@ def inverse_left_jacobian(twist: Array) -> Array:
     return np.asarray(np.eye(6) - 0.5 * ad + square / 12 - fourth / 720 + fourth @ square / 30240)
 
 
-def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE) -> Array:
+def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE, open_below: float = -np.inf) -> Array:
     """Observed information, kept between `smallest` and 1 times the Gauss-Newton information per direction.
 
     Gauss-Newton holds the assignment of partners fixed and so takes steps that are too short (expectation
     maximisation); the observed information knows that partners change, but may be indefinite far from the optimum.
+    Directions that keep less than the share `open_below` are given `smallest`.
     """
     values, half, scale = _shares(data)
-    half = half * np.sqrt(np.clip(values, smallest, 1.0))
+    half = half * np.sqrt(np.where(values < open_below, smallest, np.clip(values, smallest, 1.0)))
     return np.asarray((half @ half.T) / np.outer(scale, scale))
 
 
@@ -138,15 +143,28 @@ def climb(function: Callable[[Array], Posterior], T: Array, steps: int, toleranc
     return Climb(T, here, used, False)
 
 
-def rung_pairs(source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment) -> tuple[Pairs, Pairs] | None:
-    """Pairs in both directions among the components that both cameras see under T; None when too few are left."""
+def rung_pairs(
+    source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment, density: float = 1.0
+) -> tuple[Pairs, Pairs] | None:
+    """Pairs in both directions among the components that both cameras see under T; None when too few are left.
+
+    Rows are thinned to the rung's components, partners only to the rung's resolution: a covariance scaled by s covers
+    s components, and `density` partners are kept for each such kernel. Two equally thin mixtures would be two grids,
+    and a textureless wall would snap from grid to grid.
+    """
     back = se3_inverse(T)
-    x, y = thin(source, rung.components), thin(target, rung.components)
+    x, y = _at_resolution(source, rung, density), _at_resolution(target, rung, density)
     x_seen = x.take(visible(x, T, target.frustum, settings.occlusion_ratio))
     y_seen = y.take(visible(y, back, source.frustum, settings.occlusion_ratio))
-    if min(len(x_seen), len(y_seen)) < MIN_ROWS:
+    x_rows = thin(x_seen, int(np.ceil(len(x_seen) * min(1.0, rung.components / len(x)))))
+    y_rows = thin(y_seen, int(np.ceil(len(y_seen) * min(1.0, rung.components / len(y)))))
+    if min(len(x_rows), len(y_rows)) < MIN_ROWS:
         return None
-    return pair_up(x_seen, y_seen, T, rung, settings), pair_up(y_seen, x_seen, back, rung, settings)
+    return pair_up(x_rows, y_seen, T, rung, settings), pair_up(y_rows, x_seen, back, rung, settings)
+
+
+def _at_resolution(cloud: Cloud, rung: Rung, density: float) -> Cloud:
+    return thin(cloud, max(rung.components, int(density * len(cloud) / max(rung.covariance_scale, 1.0))))
 
 
 def displacement(points: Array, covariance: Array) -> Array:
@@ -192,5 +210,14 @@ def anneal(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, sett
 
         end = climb(function, T, rung.steps, settings.tolerance)
         T, used = end.T, used + end.iterations
-        solution = Solution(T, end.posterior, used, end.converged, pairs, weight)
-    return solution
+        solution = Solution(T, end.posterior, used, end.converged, weight, end.posterior.data)
+    return solution if solution is None else _seen_closely(solution, source, target, settings)
+
+
+def _seen_closely(solution: Solution, source: Cloud, target: Cloud, settings: Alignment) -> Solution:
+    """The solution with its last rung's data seen again at the final pose, with many partners per row."""
+    rung = replace(settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
+    pairs = rung_pairs(source, target, solution.T, rung, settings, FINAL_DENSITY)
+    if pairs is None:
+        return solution
+    return replace(solution, pairs=pairs, data=two_way(*pairs, solution.T))

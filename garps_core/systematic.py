@@ -1,23 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that all pixels of one depth map share, and so do not average out: scale, tilt and bowl.
+"""Errors that all pixels of one view share, and so do not average out.
 
-A depth map's relative error is modelled as white noise (`Lifting.noise_*`) plus a sum of six smooth modes over the
-image, the polynomials 1, x, y, x^2, xy, y^2 of the ray's slopes scaled to about +-1 across the field of view. The
-first is the map's scale error. What a mode of one sigma does to the pose is added to the pose's covariance.
+Noise is not all: a depth map may be off in scale and smoothly warped, and a calibration's principal point is off by a
+fraction of a pixel. Eight modes of one view stand for them, each a field of displacements of its points p:
+
+    0..5  p times the polynomials 1, x, y, x^2, xy, y^2 of the ray's slopes, scaled to about +-1 across the image:
+          relative depth error; the first is the scale
+    6, 7  z times the x and y axes: the direction in which the camera believes a pixel to look, in rad
+
+What one sigma of every mode does to the pose is added to the pose's covariance.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from garps_core.config import Lifting
 from garps_core.geometry import Array
 
-MODES = 6
 FIELD_SLOPE = 0.6
-"""Slope |x/z| at the image border that the modes are scaled to (about a 62 degree field of view)."""
+"""Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""
 
 
-def depth_modes(points: Array) -> Array:
-    """Points (n, 3) in the camera that measured them -> (n, 6): relative depth change per unit of each mode."""
+def shared_errors(points: Array) -> Array:
+    """Points (n, 3) m in the camera that measured them -> (n, 3, 8) displacement per unit of each mode."""
     x, y = (points[:, axis] / np.maximum(points[:, 2], 1e-6) / FIELD_SLOPE for axis in (0, 1))
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    depth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    fields = np.zeros((len(points), 3, 8))
+    fields[:, :, :6] = points[:, :, None] * depth[:, None, :]
+    fields[:, 0, 6] = fields[:, 1, 7] = points[:, 2]
+    return fields
+
+
+def shared_sigmas(lifting: Lifting) -> Array:
+    """Sigmas (8,) of the modes."""
+    return np.array([lifting.scale_sigma] + [lifting.warp_sigma] * 5 + [lifting.pointing_sigma_rad] * 2)

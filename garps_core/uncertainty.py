@@ -7,22 +7,18 @@ covariance of the position itself and of small rotations about the fixed axes: (
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import torch
 
+from garps_core.config import Lifting
 from garps_core.geometry import Array, adjoint, se3_inverse, skew
-from garps_core.objective import Pairs
-from garps_core.solve import Solution, curvature, two_way
-from garps_core.systematic import MODES, depth_modes
+from garps_core.objective import Pairs, row_information
+from garps_core.solve import Solution, curvature
+from garps_core.systematic import shared_errors, shared_sigmas
 
-RELATIVE_STEP = 1e-3
-"""Relative depth change by which the effect of a shared depth error is probed."""
-MODE_ROWS = 600
-"""Rows per direction that probe the effect of shared depth errors."""
-OPEN_DIRECTION = 1e-3
-"""Directions in which re-assigning partners cancels the curvature keep this share of it: a very large variance."""
+OPEN_BELOW = 0.02
+"""A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""
+OPEN_DIRECTION = 1e-5
+"""Share of the curvature that open directions are given: a very large variance."""
 
 
 def _position_from_twist(t: Array) -> Array:
@@ -50,67 +46,44 @@ def inverted(covariance: Array, T: Array) -> Array:
     return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)
 
 
-def pose_covariance(solution: Solution, precision: Array, mode_sigmas: Array) -> Array:
+def pose_covariance(solution: Solution, precision: Array, lifting: Lifting) -> Array:
     """6x6 covariance (ROS meaning) at the solution.
 
     Inverse of (weighted observed information of the data + precision of the prior), plus what one sigma of every
-    shared depth mode of either view does to the optimum.
+    error that all points of a view share does to the optimum.
 
     Args:
-        solution: pose, pairs of the last rung and weight of the data term.
+        solution: pose, and pairs chosen anew at it with many partners each (few, frozen partners look like curvature).
         precision: 6x6 inverse covariance of the prior, left twist.
-        mode_sigmas: (6,) sigmas of the relative depth error modes of one view.
+        lifting: sigmas of the shared errors.
     """
-    H = solution.weight * curvature(solution.posterior.data, OPEN_DIRECTION) + precision
-    inverse = np.linalg.inv(H)
-    covariance = inverse.copy()
-    for view in ("source", "target") if solution.pairs else ():
-        effect = inverse @ (solution.weight * _gradient_per_mode(solution, view)) * mode_sigmas
-        covariance += effect @ effect.T
+    data, weight = solution.data, solution.weight
+    covariance = np.linalg.inv(weight * curvature(data, OPEN_DIRECTION, OPEN_BELOW) + precision)
+    if solution.pairs is not None:
+        held = np.linalg.inv(weight * data.information + precision)
+        for pull in shared_pull(*solution.pairs, solution.T):
+            effect = held @ (weight * pull) * shared_sigmas(lifting)
+            covariance += effect @ effect.T
     return ros_from_twist(0.5 * (covariance + covariance.T), solution.T)
 
 
-def _gradient_per_mode(solution: Solution, view: str) -> Array:
-    """(6, m) change of the data gradient per unit of each depth mode of one view, by finite differences."""
-    few = tuple(_thinned(pairs) for pairs in solution.pairs or ())
-    here = two_way(few[0], few[1], solution.T).gradient
-    changed = [
-        two_way(*_with_depth_error(few, view, mode, RELATIVE_STEP), solution.T).gradient for mode in range(MODES)
-    ]
-    return np.stack([(gradient - here) / RELATIVE_STEP for gradient in changed], axis=1)
+def shared_pull(forward: Pairs, backward: Pairs, T: Array) -> tuple[Array, Array]:
+    """What each shared error of the source's, and of the target's, points adds to the gradient of `two_way`.
+
+    Partners are held, as in the Gauss-Newton information: -J' Q dd for a displacement dd of rows minus partners.
+
+    Returns:
+        Two (6, 8) arrays over the left twist of T, per unit of each mode.
+    """
+    A = -adjoint(se3_inverse(T))
+    rows_f, partners_f = _one_way_pull(forward, T)
+    rows_b, partners_b = _one_way_pull(backward, se3_inverse(T))
+    return 0.5 * (rows_f + A.T @ partners_b), 0.5 * (partners_f + A.T @ rows_b)
 
 
-def _thinned(pairs: Pairs) -> Pairs:
-    """At most MODE_ROWS rows, evenly: a smooth depth error needs no more to show its effect."""
-    step = max(1, len(pairs.means) // MODE_ROWS)
-    weights = pairs.weights[::step]
-    return Pairs(
-        pairs.means[::step],
-        pairs.covariances[::step],
-        weights / weights.sum(),
-        pairs.log_floor[::step],
-        pairs.partner_means[:, :, ::step].contiguous(),
-        pairs.partner_covariances[:, :, ::step].contiguous(),
-        pairs.log_weights[:, ::step].contiguous(),
-    )
-
-
-def _with_depth_error(pairs: tuple[Pairs, ...], view: str, mode: int, step: float) -> tuple[Pairs, Pairs]:
-    forward, backward = pairs
-    if view == "source":
-        return _rows_scaled(forward, mode, step), _partners_scaled(backward, mode, step)
-    return _partners_scaled(forward, mode, step), _rows_scaled(backward, mode, step)
-
-
-def _factor(points: torch.Tensor, mode: int, step: float) -> torch.Tensor:
-    shape = depth_modes(points.reshape(-1, 3).double().cpu().numpy())[:, mode]
-    return torch.as_tensor(1 + step * shape, dtype=points.dtype, device=points.device).reshape(points.shape[:-1])
-
-
-def _rows_scaled(pairs: Pairs, mode: int, step: float) -> Pairs:
-    return replace(pairs, means=pairs.means * _factor(pairs.means, mode, step)[:, None])
-
-
-def _partners_scaled(pairs: Pairs, mode: int, step: float) -> Pairs:
-    points = pairs.partner_means.permute(1, 2, 0)
-    return replace(pairs, partner_means=pairs.partner_means * _factor(points, mode, step))
+def _one_way_pull(pairs: Pairs, T: Array) -> tuple[Array, Array]:
+    Q, moved = row_information(pairs, T)
+    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), -np.stack([skew(p) for p in moved])], axis=2)
+    JQ = J.transpose(0, 2, 1) @ Q
+    rows = T[:3, :3] @ shared_errors(pairs.means.double().cpu().numpy())
+    return -(JQ @ rows).sum(0), (JQ @ shared_errors(moved)).sum(0)

@@ -82,7 +82,7 @@ def test_swapping_the_views_gives_the_inverse_pose_and_covariance(views):
 def test_moving_the_target_frame_moves_the_estimate_with_it(small):
     """Without a camera nothing is special about the target frame; shared depth errors, which know one, are off."""
     source, target = (replace(mixture, frustum=None) for mixture in small)
-    config = EXACT.replace({"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0})
+    config = EXACT.replace({f"lifting.{name}": 0.0 for name in ("scale_sigma", "warp_sigma", "pointing_sigma_rad")})
     B = random_pose(9, 1.0)
     prior = disturbed()
     twist = twist_from_ros(prior.covariance, prior.T_target_source)

@@ -15,7 +15,7 @@ from garps_core import Config, Mixture, Prior, align_mixtures, reconstruct
 from garps_core.geometry import se3_exp, se3_inverse
 from garps_core.metrics import pose_error
 from garps_core.reconstruct import depth_sigma
-from garps_core.systematic import FIELD_SLOPE, MODES, depth_modes
+from garps_core.systematic import FIELD_SLOPE, shared_errors, shared_sigmas
 from garps_core.uncertainty import inverted, ros_from_twist, twist_from_ros
 
 SMALL = {"camera": np.diag([0.5, 0.5, 1]) @ surfaces.K, "size": (60, 80)}
@@ -117,7 +117,7 @@ def test_covariance_is_symmetric_and_positive_definite(plain):
 
 def test_more_information_means_less_uncertainty(plain):
     """Without the errors that a whole depth map shares: those do not shrink with the number of measurements."""
-    own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0}
+    own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
     exact, more = (estimated(Config().replace({**own, "alignment.information": i})) for i in (30.0, 3000.0))
     assert (sigmas(more) < 0.2 * sigmas(exact)).all() and (sigmas(more) > 0.05 * sigmas(exact)).all()
     assert (sigmas(exact) < sigmas(plain) * (1 + 1e-6)).all()
@@ -144,7 +144,7 @@ def test_a_scale_error_moves_the_camera_along_its_view():
 
 def test_a_tight_prior_is_kept_and_makes_the_pose_certain(plain):
     known = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
-    own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0}
+    own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
     prior = disturbed(twist=np.zeros(6), covariance=known)
     tight = estimated(Config().replace(own), prior)
     assert (sigmas(tight) <= np.sqrt(np.diag(prior.covariance)) * 1.0001).all()
@@ -168,14 +168,28 @@ def noisy(view, config, rng):
     lifting = config.lifting
     v, u = np.mgrid[: view.depth.shape[0], : view.depth.shape[1]].astype(float)
     slopes = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
-    shared = depth_modes(slopes.reshape(-1, 3)) @ (rng.normal(size=MODES) * lifting.mode_sigmas())
+    drawn_modes = rng.normal(size=8) * shared_sigmas(lifting)
+    shared = shared_errors(slopes.reshape(-1, 3))[:, 2] @ drawn_modes  # along z: the pointing is left out
     white = rng.normal(size=view.depth.shape) * depth_sigma(view.depth, lifting)
     return replace(view, depth=(view.depth * (1 + shared.reshape(view.depth.shape)) + white).astype(np.float32))
 
 
-def test_depth_modes_are_polynomials_of_the_slope():
+def test_shared_errors_are_depth_polynomials_of_the_slope_and_two_turns():
     points = np.array([[0, 0, 2], [FIELD_SLOPE, -FIELD_SLOPE, 1]]) * 1.5
-    np.testing.assert_allclose(depth_modes(points), [[1, 0, 0, 0, 0, 0], [1, 1, -1, 1, -1, 1]])
+    fields = shared_errors(points)
+    np.testing.assert_allclose(fields[:, 2, :6] / points[:, 2:], [[1, 0, 0, 0, 0, 0], [1, 1, -1, 1, -1, 1]])
+    np.testing.assert_allclose(fields[1, :, 1], points[1])  # along the ray
+    np.testing.assert_allclose(fields[:, :, 6:], [[[3, 0], [0, 3], [0, 0]], [[1.5, 0], [0, 1.5], [0, 0]]])
+
+
+def test_pointing_errors_shift_the_pose():
+    """With depth exact, a camera that looks elsewhere than it believes moves its points sideways by angle times z."""
+    sigma, z = 0.02, 2.4
+    shared = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0}
+    none = estimated(Config().replace(shared | {"lifting.pointing_sigma_rad": 0.0}), disturbed())
+    grown = estimated(Config().replace(shared | {"lifting.pointing_sigma_rad": sigma}), disturbed())
+    shift = np.sqrt(np.diag(grown.covariance - none.covariance)[:2])
+    np.testing.assert_allclose(shift, sigma * z * np.sqrt(2), rtol=0.15)  # both views
 
 
 @pytest.mark.parametrize("exaggeration", [1, 4])
