@@ -134,7 +134,7 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     if like.is_cuda:
         found = [torch.cdist(block, them).topk(k, largest=False) for block in torch.split(moved, 4096)]
         return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
-    distance, index = cKDTree(them.numpy(), balanced_tree=False, compact_nodes=False).query(
+    distance, index = cKDTree(them.numpy(), balanced_tree=False, compact_nodes=False, leafsize=32).query(
         moved.numpy(), k=k, workers=-1
     )
     shape = (len(rows), k)
