@@ -21,10 +21,14 @@ from garps_core.geometry import Array
 FIELD_SLOPE = 0.6
 """Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""
 
+LARGEST = 3.0
+"""Slopes, in field slopes, beyond which the polynomials are held: no camera's image, but any mixture may be given."""
+
 
 def shared_errors(points: Array) -> Array:
     """Points (n, 3) m in the camera that measured them -> (n, 3, 8) displacement per unit of each mode."""
-    x, y = (points[:, axis] / np.maximum(points[:, 2], 1e-6) / FIELD_SLOPE for axis in (0, 1))
+    z = np.maximum(points[:, 2], 1e-6)
+    x, y = (np.clip(points[:, axis] / z / FIELD_SLOPE, -LARGEST, LARGEST) for axis in (0, 1))
     depth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     fields = np.zeros((len(points), 3, 8))
     fields[:, :, :6] = points[:, :, None] * depth[:, None, :]
