@@ -10,7 +10,6 @@ Rows (one per pair, start and method) go to rows.csv and run.json, tables to tab
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -27,6 +26,7 @@ from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, t
 from bench.tables import Row, machine_facts, print_tables, summarise, write
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
+from garps_core.settings import changed_config
 
 GARPS, START = "garps", "(start)"
 TABLE_WIDTH = 170
@@ -132,8 +132,7 @@ def _row(
 
 
 def _settings(preset: str | None, changes: Sequence[str], monocular: bool) -> Config:
-    values = {name: json.loads(value) for name, value in (change.split("=", 1) for change in changes)}
-    return Config.preset(preset or ("monocular" if monocular else "sensor")).replace(values)
+    return changed_config(Config.preset(preset or ("monocular" if monocular else "sensor")), changes)
 
 
 def main(

@@ -6,10 +6,9 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-import torch
 import typer
 from scipy.spatial.transform import Rotation
 
@@ -17,10 +16,12 @@ from garps_core import __version__
 from garps_core.align import estimate_relative_pose
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.config import Config
-from garps_core.errors import ConfigError, GarpsError, InputError
+from garps_core.errors import GarpsError, InputError
 from garps_core.files import read_view
+from garps_core.pairing import checked_device
 from garps_core.reconstruct import reconstruct
 from garps_core.report import as_json, as_text
+from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, Prior, View
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
@@ -137,35 +138,10 @@ def doctor() -> int:
 
 
 def _configured(preset: str, changes: list[str], device: str | None) -> Config:
-    config = Config.preset(preset)
-    for change in changes:
-        name, equals, text = change.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {change!r} has no '=': expected NAME=VALUE, e.g. --set lifting.stride=4")
-        config = config.replace({name: _value(name, text, config.settings().get(name))})
+    config = changed_config(Config.preset(preset), changes)
     config = config if device is None else config.replace({"device": device})
-    try:
-        torch.empty(0, device=config.device)
-    except (RuntimeError, AssertionError):
-        raise ConfigError(f"device {config.device!r} is not here: expected one of those `garps doctor` lists") from None
+    checked_device(config.device)
     return config
-
-
-def _value(name: str, text: str, current: Any) -> Any:
-    """Text to the type the setting has now; Config itself checks names and ranges."""
-    if isinstance(current, bool):
-        if text.lower() not in ("true", "false"):
-            raise ConfigError(f"{name} is {text!r}: expected true or false")
-        return text.lower() == "true"
-    if isinstance(current, tuple):
-        raise ConfigError(f"{name} cannot be set from the command line: expected a number or a word setting")
-    if isinstance(current, (int, float)):
-        try:
-            return type(current)(text)
-        except ValueError:
-            kind = "an integer" if isinstance(current, int) else "a number"
-            raise ConfigError(f"{name} is {text!r}: expected {kind}") from None
-    return text
 
 
 def _intrinsics(option: str, values: Four) -> Float64Array:

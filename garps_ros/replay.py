@@ -19,13 +19,13 @@ from rich.progress import Progress
 from garps_core.align import estimate_relative_pose
 from garps_core.config import Config
 from garps_core.errors import ConfigError
+from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.frames import Frames
 from garps_ros.outputs import Outputs
 from garps_ros.session import record, stop_on_signals
-from garps_ros.settings import changed_config
 from garps_ros.summary import Summary
 from garps_ros.topics import CameraTopics, choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker

@@ -23,11 +23,11 @@ def changed_config(config: Config, changes: Iterable[str]) -> Config:
 def _value(name: str, text: str, current: Any) -> Any:
     """Text to the type of the present value; Config itself checks names and ranges."""
     if isinstance(current, bool):
-        if text not in ("true", "false"):
+        if text.lower() not in ("true", "false"):
             raise ConfigError(f"{name} is {text!r}: expected true or false")
-        return text == "true"
+        return text.lower() == "true"
     if isinstance(current, tuple):
-        raise ConfigError(f"{name} cannot be set as text: expected the name of a number or a word")
+        raise ConfigError(f"{name} cannot be set as text: expected a number or a word setting")
     if isinstance(current, (int, float)):
         try:
             return type(current)(text)
