@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ContextDecorator
 
 import numpy as np
 import torch
@@ -76,12 +76,36 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
             raise InputError(
                 f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
             )
-    with _one_thread():
-        estimate = _aligned(source, target, initial, config)
+    estimate = _aligned(source, target, initial, config)
     estimate.seconds["align"] = time.perf_counter() - begin
     return estimate
 
 
+class _OneThread(ContextDecorator):
+    """Keep torch to the calling thread, for as long as any caller is inside.
+
+    Its helpers gain nothing on planes that fit the cache, and on a busy machine their busy-waiting makes every
+    operation many times slower. The number of threads is torch's own, one for the process: the first caller in notes
+    it, the last one out restores it.
+    """
+
+    _lock, _inside, _before = threading.Lock(), 0, 1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if _OneThread._inside == 0:
+                _OneThread._before = torch.get_num_threads()
+                torch.set_num_threads(1)
+            _OneThread._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            _OneThread._inside -= 1
+            if _OneThread._inside == 0:
+                torch.set_num_threads(_OneThread._before)
+
+
+@_OneThread()
 def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -> PoseEstimate:
     x, y = to_cloud(source, config), to_cloud(target, config)
     settings = config.alignment
@@ -115,18 +139,6 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         solution.iterations,
         solution.data.value,
     )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to the calling thread: its helpers gain nothing on planes that fit the cache, and on a busy machine
-    their busy-waiting makes every operation many times slower. The old number comes back afterwards."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64Array) -> float:
