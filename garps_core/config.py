@@ -136,6 +136,9 @@ class Alignment(_Checked):
         Rung(4.0, 4000, 12, 8),
         Rung(2.0, 8000, 12, 20),
     )
+    partner_density: float = setting(
+        1.0, "partners kept for each kernel-sized patch of a mixture; at least the rung's components", low=0, high=100
+    )
     colour_variance: float = setting(0.02, "variance of each colour channel (0..1)", unit="", low=1e-4, high=100)
     semantic_discount: float = setting(0.92, "weight of a pair with different labels", unit="", low=0, high=1)
     outlier_floor: float = setting(
@@ -248,6 +251,7 @@ def _monocular() -> Config:
         alignment=Alignment(
             ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 20)),
             colour_variance=0.01,
+            partner_density=0.25,
             depth_weight=0.2,
             information=3.0,
         ),

@@ -144,7 +144,7 @@ def climb(function: Callable[[Array], Posterior], T: Array, steps: int, toleranc
 
 
 def rung_pairs(
-    source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment, density: float = 1.0
+    source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment, density: float
 ) -> tuple[Pairs, Pairs] | None:
     """Pairs in both directions among the components that both cameras see under T; None when too few are left.
 
@@ -200,7 +200,7 @@ def anneal(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, sett
     T, used = T_prior, 0
     solution: Solution | None = None
     for rung in settings.ladder[entry(source, T_prior, covariance, settings.ladder) :]:
-        pairs = rung_pairs(source, target, T, rung, settings)
+        pairs = rung_pairs(source, target, T, rung, settings, settings.partner_density)
         if pairs is None:
             return None
         weight = settings.information * rung.covariance_scale  # wider kernels anneal, they do not measure less

@@ -130,7 +130,7 @@ def test_noisier_depth_makes_the_start_less_certain():
 
 FAILURES = {
     "no matches": (exact_matches(count=0), "0 feature matches, 0 with depth: no pose fits them"),
-    "too few": (exact_matches(count=11), "11 feature matches, 11 with depth: no pose fits them"),
+    "too few": (exact_matches(count=7), "7 feature matches, 7 with depth: no pose fits them"),
     "nothing but outliers": (
         exact_matches(count=40, outliers=40),
         r"40 feature matches, \d+ fit one pose: expected at",
