@@ -39,7 +39,7 @@ def rung(views):
     """Both directions' pairs of the last rung at the disturbed start, and the start's twist covariance."""
     x, y = (to_cloud(mixture, DOUBLE) for mixture in views)
     start = disturbed(twist=0.2 * DISTURBANCE).T_target_source
-    return *solve.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment), start
+    return *solve.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment, density=1.0), start
 
 
 def test_the_start_is_as_far_off_as_it_claims():
