@@ -124,15 +124,15 @@ class Climb:
 def climb(function: Callable[[Array], Posterior], T: Array, steps: int, tolerance: float) -> Climb:
     """Levenberg-damped ascent: at most `steps` evaluations beyond the first, never downhill.
 
-    Stops when a step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
+    Stops when the undamped step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
     """
     here = function(T)
     damping, used = 1e-3, 0
     while used < steps:
         H = here.information
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(6), here.gradient)
-        if float(step @ H @ step) < tolerance**2:
+        if float(here.gradient @ np.linalg.solve(H + 1e-12 * np.eye(6), here.gradient)) < tolerance**2:
             return Climb(T, here, used, True)
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(6), here.gradient)
         there_T = se3_exp(np.asarray(step, np.float64)) @ T
         there = function(there_T)
         used += 1
