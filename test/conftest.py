@@ -8,6 +8,8 @@ from hypothesis import settings
 # Without this, Jazzy accepts a scalar of the wrong type and publishes garbage for it.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 
-# No deadline: a shared machine may stall for longer than any example takes.
-settings.register_profile("garps", deadline=None)
-settings.load_profile("garps")
+# No deadline: a shared machine may stall for longer than any example takes. The same examples every time, so that a
+# change is judged by what it changes; GARPS_TEST_PROFILE=explore looks for new ones.
+settings.register_profile("garps", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None, max_examples=1000)
+settings.load_profile(os.environ.get("GARPS_TEST_PROFILE", "garps"))
