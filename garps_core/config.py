@@ -150,7 +150,13 @@ class Alignment(_Checked):
         low=1e-3,
         high=1,
     )
-    max_distance_m: float = setting(2.5, "partners further apart are ignored", unit="m", low=1e-3, high=1000)
+    max_distance_m: float = setting(
+        2.5,
+        "partners further apart are ignored; has no metres to compare, and so no say, with depth_weight below 1",
+        unit="m",
+        low=1e-3,
+        high=1000,
+    )
     occlusion_ratio: float = setting(
         0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
     )

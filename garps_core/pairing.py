@@ -124,7 +124,7 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
 
 
 def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
-    """Indices and distances (n, k) of the nearest partners by Euclidean distance of the means."""
+    """Indices and distances (n, k) of the nearest partners; metres, or image coordinates if depth_weight < 1."""
     like = rows.means
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
     moved = like @ R.T + t

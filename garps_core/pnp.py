@@ -25,6 +25,7 @@ from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
 
 MIN_PIXEL_SIGMA = 0.3
+"""px; no residuals, however small, make a match more precise than features are."""
 HUBER = 2.0
 """Residuals beyond this many sigmas count with their length, not its square."""
 REFINEMENT_STEPS = 8
