@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
-from garps_ros.frames import Frame, Frames
-from garps_ros.outputs import Row
+from garps_ros.cameras import Frame
 from garps_ros.tracking import Estimator, KeyframeTracker
 from garps_ros.views import view_from_messages
 from msg_adapters import MessageError, header_frame_id
@@ -22,6 +21,22 @@ FAILURES: dict[type[Exception], str] = {
     ReconstructionError: "no_reconstruction",
 }
 OTHER_FAILURE = "core_error"
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One line of poses.csv: an estimate of `source` in `target`, or why there is none."""
+
+    source_stamp_ns: int
+    target_stamp_ns: int
+    source_frame: str
+    target_frame: str
+    status: str
+    reason: str
+    overlap: float | None = None
+    T_target_source: Float64Array | None = None
+    covariance: Float64Array | None = None
+    segment: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,47 +94,64 @@ class ViewReader:
         return view
 
 
-def estimate_pairs(frames: Frames, reader: ViewReader, estimate: Estimator) -> Iterator[Origin | Outcome]:
-    """Two cameras: the pose of the first of `frames` (source) in the second (target), pair by pair."""
+def estimate_pairs(
+    pairs: Iterable[tuple[Frame, Frame]], reader: ViewReader, estimate: Estimator
+) -> Iterator[Origin | Outcome]:
+    """Two cameras: the pose of the first of each pair (source) in the second (target)."""
     begun = False
-    for source, target in frames.pairs():
-        began = time.perf_counter()
-        target_name, source_name = _two_names(target, source)
+    for source, target in pairs:
+        outcome = estimate_pair(source, target, reader, estimate)
         if not begun:
-            yield Origin(0, target_name, source_name)
+            yield Origin(0, outcome.frame_id, outcome.child_frame_id)
             begun = True
-        names, stamps = (source_name, target_name), (source.stamp_ns, target.stamp_ns)
-        try:
-            found = estimate(reader.read(source), reader.read(target))
-        except (MessageError, GarpsError) as error:
-            yield Outcome(_failed(stamps, names, 0, error), target_name, source_name, None, None, None)
-            continue
-        T, covariance = (found.T_target_source, found.covariance) if found.ok else (None, None)
-        seconds = time.perf_counter() - began
-        yield Outcome(_row(stamps, names, 0, found), target_name, source_name, T, covariance, seconds)
+        yield outcome
 
 
-def estimate_keyframes(frames: Frames, reader: ViewReader, tracker: KeyframeTracker) -> Iterator[Origin | Outcome]:
+def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimator) -> Outcome:
+    """The pose of the source camera in the target camera, or why there is none."""
+    began = time.perf_counter()
+    target_name, source_name = _two_names(target, source)
+    names, stamps = (source_name, target_name), (source.stamp_ns, target.stamp_ns)
+    try:
+        found = estimate(reader.read(source), reader.read(target))
+    except (MessageError, GarpsError) as error:
+        return Outcome(_failed(stamps, names, 0, error), target_name, source_name, None, None, None)
+    T, covariance = (found.T_target_source, found.covariance) if found.ok else (None, None)
+    seconds = time.perf_counter() - began
+    return Outcome(_row(stamps, names, 0, found), target_name, source_name, T, covariance, seconds)
+
+
+def estimate_keyframes(
+    frames: Iterable[Frame], reader: ViewReader, tracker: KeyframeTracker
+) -> Iterator[Origin | Outcome]:
     """One camera: its pose in the first keyframe of the segment; rows hold the pose in the keyframe that was used."""
-    for frame in frames.singles():
-        began = time.perf_counter()
-        name = header_frame_id(frame.image) or _topic_name(frame)
-        start = f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
-        try:
-            view = reader.read(frame)
-            if tracker.begins(view):
-                start = f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
-                yield Origin(tracker.segment, start, name, view.stamp_ns)
-                continue
-            for attempt in tracker.follow(view):
-                stamps = frame.stamp_ns, attempt.target.stamp_ns
-                row = _row(stamps, (name, name), tracker.segment, attempt.estimate)
-                seconds = time.perf_counter() - began
-                yield Outcome(row, start, name, attempt.T_start_source, attempt.covariance, seconds)
-                began = time.perf_counter()
-        except (MessageError, GarpsError) as error:
-            stamps = frame.stamp_ns, tracker.keyframe_stamp_ns
-            yield Outcome(_failed(stamps, (name, name), tracker.segment, error), start, name, None, None, None)
+    for frame in frames:
+        yield from follow_frame(frame, reader, tracker)
+
+
+def follow_frame(frame: Frame, reader: ViewReader, tracker: KeyframeTracker) -> Iterator[Origin | Outcome]:
+    """One more frame of the camera: an Origin where a segment begins, else every attempt at a pose."""
+    began = time.perf_counter()
+    name = header_frame_id(frame.image) or _topic_name(frame)
+    try:
+        view = reader.read(frame)
+        if tracker.begins(view):
+            yield Origin(tracker.segment, _start_name(name, tracker), name, view.stamp_ns)
+            return
+        for attempt in tracker.follow(view):
+            stamps = frame.stamp_ns, attempt.target.stamp_ns
+            row = _row(stamps, (name, name), tracker.segment, attempt.estimate)
+            seconds = time.perf_counter() - began
+            start = _start_name(name, tracker)
+            yield Outcome(row, start, name, attempt.T_start_source, attempt.covariance, seconds)
+            began = time.perf_counter()
+    except (MessageError, GarpsError) as error:
+        stamps, start = (frame.stamp_ns, tracker.keyframe_stamp_ns), _start_name(name, tracker)
+        yield Outcome(_failed(stamps, (name, name), tracker.segment, error), start, name, None, None, None)
+
+
+def _start_name(name: str, tracker: KeyframeTracker) -> str:
+    return f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
 
 
 def _two_names(target: Frame, source: Frame) -> tuple[str, str]:

@@ -4,29 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from garps_ros.bags import Bag
+from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.pairing import Pairer
-from garps_ros.topics import CameraTopics
 from msg_adapters import MessageError, header_stamp_ns
 
 IMAGE, DEPTH = 0, 1
 
 Refused = Callable[[str], None]
 """Called with the reason when a message cannot be used at all."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What one camera saw at one time, as messages."""
-
-    topics: CameraTopics
-    stamp_ns: int
-    image: Any
-    depth: Any
-    info: Any
 
 
 class Frames:

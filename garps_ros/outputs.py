@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import shutil
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
@@ -18,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from garps_core.checks import Float64Array
 from garps_ros.bags import BagError
+from garps_ros.estimates import Row
 from msg_adapters import PoseWriter, ns_to_stamp
 
 BAG_FOLDER, CSV_FILE = "poses", "poses.csv"
@@ -30,22 +30,6 @@ COLUMNS = [
     *("overlap", *POSE_COLUMNS, *(f"c{i}{j}" for i, j in UPPER)),
 ]
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (s, m, unit quaternion)\n"
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One line of poses.csv: an estimate of `source` in `target`, or why there is none."""
-
-    source_stamp_ns: int
-    target_stamp_ns: int
-    source_frame: str
-    target_frame: str
-    status: str
-    reason: str
-    overlap: float | None = None
-    T_target_source: Float64Array | None = None
-    covariance: Float64Array | None = None
-    segment: int = 0
 
 
 class Outputs:

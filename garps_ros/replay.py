@@ -22,12 +22,13 @@ from garps_core.errors import ConfigError
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
+from garps_ros.cameras import CameraTopics
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.frames import Frames
 from garps_ros.outputs import Outputs
 from garps_ros.session import record, stop_on_signals
 from garps_ros.summary import Summary
-from garps_ros.topics import CameraTopics, choose_cameras
+from garps_ros.topics import choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
 
 NAME = "garps-replay"
@@ -159,8 +160,8 @@ def _outcomes(
         return estimate_relative_pose(source, target, config)
 
     if cameras == 2:
-        return estimate_pairs(frames, reader, estimate)
-    return estimate_keyframes(frames, reader, KeyframeTracker(estimate, rule))
+        return estimate_pairs(frames.pairs(), reader, estimate)
+    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule))
 
 
 def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:

@@ -4,26 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from garps_ros.bags import Bag, BagError
+from garps_ros.cameras import CameraTopics
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPES = ("sensor_msgs/msg/CameraInfo",)
 TRANSPORTS = ("compressed", "compressedDepth")
 REGISTERED = ("aligned", "registered", "depth_to_rgb", "depth_to_color")
-
-
-@dataclass(frozen=True)
-class CameraTopics:
-    """The topics of one camera; empty = not known yet."""
-
-    image: str = ""
-    info: str = ""
-    depth: str = ""
-
-    def __str__(self) -> str:
-        return f"image {self.image}, info {self.info}, depth {self.depth}"
 
 
 def choose_cameras(bag: Bag, source: CameraTopics, target: CameraTopics, pairing: str) -> list[CameraTopics]:
