@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from garps_core.errors import ConfigError
 
@@ -23,21 +23,35 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    live: bool = True,
 ) -> Any:
-    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated."""
-    return field(default=default, metadata={"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices})
+    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated.
+
+    `live` = it may be changed while a node runs.
+    """
+    described = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
+    return field(default=default, metadata=described)
 
 
 _KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
 
 
-class _Checked:
-    """Checks every field of a settings dataclass against its own description."""
+class Checked:
+    """Base of a settings dataclass: checks every field against its own description, raises ConfigError.
+
+    Errors name a field with `prefix` before it: by default the class in lower case and a dot.
+    """
+
+    _prefix: ClassVar[str]
+
+    def __init_subclass__(cls, prefix: str | None = None) -> None:
+        super().__init_subclass__()
+        cls._prefix = f"{cls.__name__.lower()}." if prefix is None else prefix
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
             value, limits = getattr(self, f.name), f.metadata
-            name = f"{type(self).__name__.lower()}.{f.name}"
+            name = self._prefix + f.name
             if limits.get("choices") and value not in limits["choices"]:
                 raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
             if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
@@ -58,7 +72,7 @@ def _check_number(name: str, value: Any, default: float, limits: Mapping[str, An
 
 
 @dataclass(frozen=True)
-class Lifting(_Checked):
+class Lifting(Checked):
     """How a pixel with depth becomes a Gaussian (`reconstruct`)."""
 
     stride: int = setting(2, "use every n-th pixel in both image directions", unit="px", low=1, high=32)
@@ -88,7 +102,7 @@ class Lifting(_Checked):
 
 
 @dataclass(frozen=True)
-class Start(_Checked):
+class Start(Checked):
     """Where the alignment starts (`initialise`)."""
 
     method: str = setting(
@@ -109,7 +123,7 @@ class Start(_Checked):
 
 
 @dataclass(frozen=True)
-class Rung(_Checked):
+class Rung(Checked):
     """One step of the annealing ladder."""
 
     covariance_scale: float = setting(1.0, "multiplies every component covariance", low=1e-3, high=1e4)
@@ -119,7 +133,7 @@ class Rung(_Checked):
 
 
 @dataclass(frozen=True)
-class Alignment(_Checked):
+class Alignment(Checked):
     """The objective and how it is maximised (`align_mixtures`)."""
 
     solver: str = setting(
@@ -195,7 +209,7 @@ class Alignment(_Checked):
 
 
 @dataclass(frozen=True)
-class Config(_Checked):
+class Config(Checked):
     """All settings. See the parts for their fields."""
 
     lifting: Lifting = Lifting()

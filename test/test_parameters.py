@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live node's parameters as data: complete, described, checked; and the page and the file generated from them."""
+
+import dataclasses
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from garps_core.config import Checked, Config, setting
+from garps_core.errors import ConfigError
+from garps_ros.parameters import parameters, settings_from
+from garps_ros.replay import replay
+from garps_ros.settings import NodeSettings
+
+ROOT = Path(__file__).resolve().parent.parent
+PRESETS = ("default", "sensor", "monocular", "paper")
+
+
+def values_of(preset: str = "default", **changes: object) -> dict[str, object]:
+    values: dict[str, object] = {parameter.name: parameter.default for parameter in parameters(preset)}
+    return values | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def test_a_class_chooses_how_errors_name_its_settings() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Lamp(Checked):
+        power: float = setting(1.0, "brightness", unit="W", low=0, high=5)
+
+    @dataclasses.dataclass(frozen=True)
+    class Bare(Checked, prefix=""):
+        power: float = setting(1.0, "brightness", unit="W", low=0, high=5)
+
+    with pytest.raises(ConfigError, match=r"^lamp\.power is 6: expected between 0 and 5 W$"):
+        Lamp(6)
+    with pytest.raises(ConfigError, match=r"^power is 6: expected between 0 and 5 W$"):
+        Bare(6)
+    with pytest.raises(ConfigError, match=r"^pairing is 'x': expected one of cameras, keyframe$"):
+        NodeSettings(pairing="x")
+
+
+def test_every_setting_is_a_parameter_except_the_ladder() -> None:
+    names = [parameter.name for parameter in parameters()]
+    own = [f.name for f in dataclasses.fields(NodeSettings)]
+    assert names == own + [name for name in Config().settings() if name != "alignment.ladder"]
+    assert names[0] == "preset" and len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_defaults_are_those_of_the_preset(preset: str) -> None:
+    declared = {parameter.name: parameter.default for parameter in parameters(preset)}
+    config = Config.preset(preset)
+    assert {name: value for name, value in config.settings().items() if name != "alignment.ladder"}.items() <= (
+        declared.items()
+    )
+    assert settings_from(declared) == (NodeSettings(preset=preset), config)
+
+
+def test_a_number_has_the_same_type_in_every_preset_and_a_range_that_holds_it() -> None:
+    for preset in PRESETS:
+        for default, parameter in zip(parameters(), parameters(preset), strict=True):
+            assert type(parameter.default) is type(default.default), parameter.name
+            assert parameter.doc, parameter.name
+            if type(parameter.default) in (int, float):
+                assert parameter.low is not None and parameter.high is not None, parameter.name
+                assert parameter.low <= parameter.default <= parameter.high, parameter.name
+            if parameter.choices:
+                assert parameter.default in parameter.choices, parameter.name
+
+
+def test_the_presets_named_are_those_that_exist() -> None:
+    (choices,) = [parameter.choices for parameter in parameters() if parameter.name == "preset"]
+    assert [Config.preset(name) for name in choices]
+    with pytest.raises(ConfigError) as raised:
+        Config.preset("")
+    assert str(raised.value).endswith(", ".join(choices))
+
+
+def test_what_cannot_change_while_the_node_runs() -> None:
+    fixed = {parameter.name for parameter in parameters() if not parameter.live}
+    expected = {"preset", "pairing", "image_transport", "depth_transport", "image_qos", "publish_tf"}
+    assert fixed == expected
+
+
+def test_the_groups() -> None:
+    groups = {parameter.name: parameter.group for parameter in parameters()}
+    assert groups["sync_slop"] == "node" and groups["device"] == "" and groups["lifting.stride"] == "lifting"
+
+
+@pytest.mark.parametrize(
+    ("own", "option"),
+    [
+        ("sync_slop", "slop"),
+        ("keyframe_overlap", "keyframe_overlap"),
+        ("keyframe_motion", "keyframe_motion"),
+        ("keyframe_rotation", "keyframe_rotation"),
+        ("rectified", "rectified"),
+        ("preset", "preset"),
+    ],
+)
+def test_the_node_and_the_replay_have_the_same_defaults(own: str, option: str) -> None:
+    assert getattr(NodeSettings(), own) == inspect.signature(replay).parameters[option].default
+
+
+def test_values_reach_the_settings() -> None:
+    node, config = settings_from(values_of("paper", sync_slop=0.5, lifting__stride=7, device="cuda:0"))
+    assert node.sync_slop == 0.5 and node.preset == "paper"
+    assert config == Config.preset("paper").replace({"lifting.stride": 7, "device": "cuda:0"})
+    assert config.alignment.ladder == Config.preset("paper").alignment.ladder != Config().alignment.ladder
+
+
+WRONG = {
+    "choice": ({"pairing": "x"}, "pairing is 'x': expected one of cameras, keyframe"),
+    "preset": ({"preset": "x"}, "preset is 'x': expected one of default, sensor, monocular, paper"),
+    "range": ({"sync_slop": 11.0}, "sync_slop is 11.0: expected between 0 and 10 s"),
+    "range of the estimator": ({"lifting__stride": 0}, "lifting.stride is 0: expected between 1 and 32 px"),
+    "not a number": ({"max_rate": float("nan")}, "max_rate is nan: expected between 0 and 1000 Hz"),
+    "no part": ({"dtype": "float16"}, "dtype is 'float16': expected one of float32, float64"),
+    "text for flag": ({"lazy": "yes"}, "lazy is 'yes': expected True or False"),
+    "unknown": ({"lifting__strid": 2}, "parameter 'lifting.strid' does not exist; did you mean 'lifting.stride'?"),
+    "ladder": ({"alignment__ladder": 2}, "parameter 'alignment.ladder' does not exist: it comes with the preset"),
+    "far from all": ({"zzz": 2}, "parameter 'zzz' does not exist; `ros2 param list` shows all names"),
+}
+
+
+@pytest.mark.parametrize(("changes", "text"), WRONG.values(), ids=WRONG)
+def test_a_wrong_value_is_one_line_that_teaches(changes: dict[str, object], text: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        settings_from(values_of(**changes))
+    assert str(raised.value).startswith(text)
+
+
+def test_a_missing_value_is_named() -> None:
+    values = values_of()
+    del values["lifting.stride"]
+    with pytest.raises(ConfigError, match=r"^parameter 'lifting\.stride' has no value"):
+        settings_from(values)
+
+
+def test_an_unknown_preset_has_no_parameters() -> None:
+    with pytest.raises(ConfigError, match=r"^preset is 'x': expected one of default"):
+        parameters("x")
+
+
+def test_the_description_needs_no_ros() -> None:
+    code = "import garps_ros.parameters, sys; print('rclpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "False", done.stderr
