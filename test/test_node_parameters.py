@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameters on a real node: declared, refused with a reason, applied as one; mistakes at the start are errors."""
 
+import dataclasses
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 import rclpy
+import yaml
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -193,3 +196,65 @@ def test_names_of_somebody_else_are_no_mistake(capfd: pytest.CaptureFixture[str]
         assert Live(node).parameters.node.rectified == "false"
     said = capfd.readouterr().err
     assert "'max_range'" in said and "'frame_id'" in said and "use_sim_time" not in said
+
+
+YAML = ROOT / "config/garps.yaml"
+
+
+def with_everything(path: Path) -> Path:
+    """The shipped file with no setting commented out."""
+    path.write_text(re.sub(r"^( +)#(?=[a-z])", r"\1", YAML.read_text("utf-8"), flags=re.M), encoding="utf-8")
+    return path
+
+
+def test_the_shipped_file_holds_every_parameter_once_with_its_default_and_type(tmp_path: Path) -> None:
+    own = yaml.safe_load(YAML.read_text("utf-8"))["/**"]["ros__parameters"]
+    assert own == {f.name: f.default for f in dataclasses.fields(NodeSettings)}
+    text = with_everything(tmp_path / "all.yaml").read_text("utf-8")
+    values = yaml.safe_load(text)["/**"]["ros__parameters"]
+    assert list(values.items()) == [(parameter.name, parameter.default) for parameter in ALL]
+    assert [type(value) for value in values.values()] == [type(parameter.default) for parameter in ALL]
+    assert all(len(re.findall(rf"^ +{re.escape(name)}:", text, re.M)) == 1 for name in values)
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_the_shipped_file_starts_a_node(tmp_path: Path, everything: bool, capfd: pytest.CaptureFixture[str]) -> None:
+    file = with_everything(tmp_path / "all.yaml") if everything else YAML
+    with ros_node("--params-file", str(file)) as node:
+        given_names = set(node._parameter_overrides)
+        live = Live(node)
+        assert (live.parameters.node, live.parameters.config) == (NodeSettings(), Config())
+    assert given_names == ({p.name for p in ALL} if everything else {f.name for f in dataclasses.fields(NodeSettings)})
+    assert "no effect" not in capfd.readouterr().err
+
+
+def test_the_shipped_file_leaves_a_preset_as_it_is() -> None:
+    with ros_node("--params-file", str(YAML), *given("preset:=monocular")) as node:
+        assert Live(node).parameters.config == Config.preset("monocular")
+
+
+def test_a_changed_line_of_the_file_counts(tmp_path: Path) -> None:
+    file = with_everything(tmp_path / "all.yaml")
+    for old, new in (("stride: 2", "stride: 9"), ("sync_slop: 0.02", "sync_slop: 0.5"), ("9.0e-05", "1.0e-07")):
+        assert old in file.read_text("utf-8")
+        file.write_text(file.read_text("utf-8").replace(old, new), encoding="utf-8")
+    with ros_node("--params-file", str(file)) as node:
+        found = Live(node).parameters
+    assert found.config.lifting.stride == 9 and found.node.sync_slop == 0.5
+    assert found.config.alignment.adam_rate_translation == 1e-7
+
+
+def test_nested_names_are_the_same_as_dotted_ones(tmp_path: Path) -> None:
+    file = tmp_path / "nested.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    lifting:\n      stride: 9\n", encoding="utf-8")
+    with ros_node("--params-file", str(file)) as node:
+        assert Live(node).parameters.config.lifting.stride == 9
+
+
+def test_the_file_of_the_page_starts_a_node(tmp_path: Path) -> None:
+    (example,) = re.findall(r"^```yaml\n(.*?)^```$", (ROOT / "docs/parameters.md").read_text("utf-8"), re.M | re.S)
+    file = tmp_path / "my.yaml"
+    file.write_text(example, encoding="utf-8")
+    with ros_node("--params-file", str(file)) as node:
+        found = Live(node).parameters
+    assert found.config == Config.preset("monocular").replace({"lifting.stride": 4}) and found.node.sync_slop == 0.03
