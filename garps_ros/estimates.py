@@ -76,17 +76,23 @@ class ViewReader:
     Args:
         rectified: "auto", "true" or "false".
         say: called with a line for people.
+        allow_resized: accept images that were scaled evenly against their CameraInfo.
     """
 
-    def __init__(self, rectified: str, say: Callable[[str], None]) -> None:
-        self._rectified, self._say = rectified, say
+    def __init__(self, rectified: str, say: Callable[[str], None], allow_resized: bool = False) -> None:
+        self.rectified, self.allow_resized, self._say = rectified, allow_resized, say
         self._said: dict[str, str] = {}
 
     def read(self, frame: Frame) -> View:
         """Decode, choose the calibration, undistort. Raises MessageError or InputError."""
         topic = frame.topics.image
         view, decision = view_from_messages(
-            frame.image, frame.info, frame.depth, topic=topic, rectified=self._rectified
+            frame.image,
+            frame.info,
+            frame.depth,
+            topic=topic,
+            rectified=self.rectified,
+            allow_resized=self.allow_resized,
         )
         if self._said.get(topic) != decision:
             self._said[topic] = decision
@@ -110,8 +116,8 @@ def estimate_pairs(
 def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimator) -> Outcome:
     """The pose of the source camera in the target camera, or why there is none."""
     began = time.perf_counter()
-    target_name, source_name = _two_names(target, source)
-    names, stamps = (source_name, target_name), (source.stamp_ns, target.stamp_ns)
+    source_name, target_name = names = frame_names(source, target)
+    stamps = source.stamp_ns, target.stamp_ns
     try:
         found = estimate(reader.read(source), reader.read(target))
     except (MessageError, GarpsError) as error:
@@ -154,10 +160,18 @@ def _start_name(name: str, tracker: KeyframeTracker) -> str:
     return f"{name}_start" + (f"_{tracker.segment}" if tracker.segment > 1 else "")
 
 
-def _two_names(target: Frame, source: Frame) -> tuple[str, str]:
+def failed_outcome(frames: tuple[Frame, ...], error: Exception) -> Outcome:
+    """The outcome of one or two frames that ended in an error nobody expected."""
+    source, target = frames[0], frames[-1]
+    names = frame_names(source, target)
+    row = _failed((source.stamp_ns, target.stamp_ns), names, 0, error)
+    return Outcome(row, names[1], names[0], None, None, None)
+
+
+def frame_names(source: Frame, target: Frame) -> tuple[str, str]:
     """Frame names of both cameras; those of their topics where the drivers give none, or the same to both."""
-    names = header_frame_id(target.image), header_frame_id(source.image)
-    return names if all(names) and names[0] != names[1] else (_topic_name(target), _topic_name(source))
+    names = header_frame_id(source.image), header_frame_id(target.image)
+    return names if all(names) and names[0] != names[1] else (_topic_name(source), _topic_name(target))
 
 
 def _topic_name(frame: Frame) -> str:
@@ -171,4 +185,5 @@ def _row(stamps: tuple[int, int], names: tuple[str, str], segment: int, found: P
 
 def _failed(stamps: tuple[int, int], names: tuple[str, str], segment: int, error: Exception) -> Row:
     kind = next((name for kind, name in FAILURES.items() if isinstance(error, kind)), OTHER_FAILURE)
-    return Row(*stamps, *names, kind, str(error), segment=segment)
+    reason = str(error) if isinstance(error, (MessageError, GarpsError)) else f"{type(error).__name__}: {error}"
+    return Row(*stamps, *names, kind, reason, segment=segment)

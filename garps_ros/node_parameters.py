@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy.parameter
-from rcl_interfaces.msg import (  # type: ignore[import-untyped]
+from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
@@ -108,7 +108,7 @@ def _check_names(node: Node, overrides: Mapping[str, Any]) -> None:
         if name.startswith(OUR_PREFIXES) or difflib.get_close_matches(name, names, n=1, cutoff=ALIKE):
             raise ConfigError(no_such_parameter(name, names))
         note = f"parameter {name!r} is given but is none of this node's: it has no effect here"
-        node.get_logger().warning(note)  # type: ignore[no-untyped-call]
+        node.get_logger().warning(note)
 
 
 def _start_preset(overrides: Mapping[str, rclpy.parameter.Parameter]) -> str:

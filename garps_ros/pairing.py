@@ -25,13 +25,14 @@ class Pairer:
         self.unpaired = [0, 0]
         """Items of each stream that found no partner."""
         self._waiting: tuple[deque[tuple[int, Any]], deque[tuple[int, Any]]] = (deque(), deque())
-        self._latest = [-1, -1]
+        self.latest = [-1, -1]
+        """Newest stamp of each stream, ns; -1 before the first."""
 
     def add(self, stream: int, stamp_ns: int, item: Any) -> list[tuple[Any, Any]] | None:
         """Add an item to stream 0 or 1; returns the pairs that are now certain, or None if its stamp does not grow."""
-        if stamp_ns <= self._latest[stream]:
+        if stamp_ns <= self.latest[stream]:
             return None
-        self._latest[stream] = stamp_ns
+        self.latest[stream] = stamp_ns
         self._waiting[stream].append((stamp_ns, item))
         pairs = self._matched(finished=False)
         if len(self._waiting[stream]) > MAX_WAITING:  # the other stream has stopped

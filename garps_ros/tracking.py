@@ -64,7 +64,7 @@ class KeyframeTracker:
     """
 
     def __init__(self, estimate: Estimator, rule: KeyframeRule) -> None:
-        self._estimate, self._rule = estimate, rule
+        self._estimate, self.rule = estimate, rule
         self._keyframe: _Located | None = None
         self._last: _Located | None = None
         self._failures = 0
@@ -79,7 +79,7 @@ class KeyframeTracker:
 
     def begins(self, view: View) -> bool:
         """Make the view the origin of a new segment if one is due: at the start, or when lost for too long."""
-        if self._keyframe is not None and self._failures < self._rule.lost_after:
+        if self._keyframe is not None and self._failures < self.rule.lost_after:
             return False
         self.segment += 1
         self._failures = 0
@@ -119,9 +119,9 @@ class KeyframeTracker:
 
     def _is_far(self, T: Float64Array, overlap: float) -> bool:
         return (
-            overlap < self._rule.min_overlap
-            or float(np.linalg.norm(T[:3, 3])) > self._rule.max_motion_m
-            or float(np.linalg.norm(so3_log(T[:3, :3]))) > self._rule.max_rotation_rad
+            overlap < self.rule.min_overlap
+            or float(np.linalg.norm(T[:3, 3])) > self.rule.max_motion_m
+            or float(np.linalg.norm(so3_log(T[:3, :3]))) > self.rule.max_rotation_rad
         )
 
 

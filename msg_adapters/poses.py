@@ -72,6 +72,21 @@ class PoseWriter:
             ),
         )
 
+    def transform_stamped(self, T: npt.ArrayLike, stamp_ns: int, frame_id: str, child_frame_id: str) -> Any:
+        """A TransformStamped of T_target_source, parent = target. Raises MessageError as `pose_stamped`."""
+        pose = self._pose(T)
+        at = {axis: getattr(pose.position, axis) for axis in "xyz"}
+        return self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_ns, frame_id),
+            child_frame_id=_checked_name("child_frame_id", child_frame_id),
+            transform=self._make(
+                "geometry_msgs/msg/Transform",
+                translation=self._make("geometry_msgs/msg/Vector3", **at),
+                rotation=pose.orientation,
+            ),
+        )
+
     def _make(self, name: str, **fields: Any) -> Any:
         return self._class(name)(**fields)
 

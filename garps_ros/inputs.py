@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The inputs of the live node by their roles: which topics they are, of which type, and who takes their messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from garps_ros.cameras import CameraTopics
+from garps_ros.intake import DEPTH, IMAGE
+from garps_ros.settings import NodeSettings
+from garps_ros.subscriptions import Input
+
+SIDES = ("source", "target")
+
+
+@dataclass(frozen=True)
+class Takers:
+    """Who takes the messages; each only stores the reference.
+
+    Args:
+        image: called with camera (0 = source), IMAGE or DEPTH, and the message.
+        info: called with camera and CameraInfo.
+        prior: called with a PoseWithCovarianceStamped.
+        say: called with kind and text of a complaint.
+    """
+
+    image: Callable[[int, int, Any], None]
+    info: Callable[[int, Any], None]
+    prior: Callable[[Any], None]
+    say: Callable[[str, str], None]
+
+
+def camera_topics(node: Node, settings: NodeSettings) -> list[CameraTopics]:
+    """The topics as remapped, by which calibrations are chosen and errors are named; one camera with a keyframe."""
+    parts = ("image", "camera_info", "depth")
+    return [CameraTopics(*(node.resolve_topic_name(f"{side}/{part}") for part in parts)) for side in _sides(settings)]
+
+
+def subscribe(node: Node, settings: NodeSettings, takers: Takers) -> list[Input]:
+    """Subscribe to everything that the settings ask for."""
+    inputs = []
+    for index, side in enumerate(_sides(settings)):
+        for part, role, transport in (
+            ("image", IMAGE, settings.image_transport),
+            ("depth", DEPTH, settings.depth_transport),
+        ):
+            name = f"{side}/{part}"
+            kind, topic = _transported(node, name, transport)
+            taker = partial(takers.image, index, role)
+            say = partial(takers.say, f"qos {name}")
+            inputs.append(Input(node, name, kind, topic, settings.image_qos, taker, say))
+        name = f"{side}/camera_info"
+        taker, say = partial(takers.info, index), partial(takers.say, f"qos {name}")
+        inputs.append(Input(node, name, CameraInfo, name, "auto", taker, say, once=True))
+    say = partial(takers.say, "qos prior")
+    prior = Input(node, "prior", PoseWithCovarianceStamped, "~/prior", "auto", takers.prior, say, True, True)
+    return [*inputs, prior]
+
+
+def _sides(settings: NodeSettings) -> tuple[str, ...]:
+    return SIDES[:1] if settings.pairing == "keyframe" else SIDES
+
+
+def _transported(node: Node, name: str, transport: str) -> tuple[Any, str]:
+    """Type and topic of an image in a transport. Remapping knows the topic without suffix, as for image_transport."""
+    return (Image, name) if transport == "raw" else (CompressedImage, f"{node.resolve_topic_name(name)}/{transport}")

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ros2 run garps_ros pose_node`: starts the node, and ends it in good order on SIGINT and SIGTERM.
+
+Exit code 0 = asked to stop, 2 = wrong parameters or no rclpy; 128 + n on a second signal.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from types import FrameType
+
+NAME = "pose_node"
+SPIN_S = 0.2
+"""A signal is noticed at the latest after this; Python's handlers do not run while the executor waits."""
+PATIENCE_S = 3.0
+"""How long a computation may go on after a signal before the process ends without it."""
+
+HELP = """The pose of one camera in another, in metres with covariance, from two RGB-D cameras; or the path of one.
+
+usage: pose_node [--help] [--ros-args ...]
+
+Subscribes (remap with -r source/image:=/left/image_rect ...)
+  source/image, target/image              sensor_msgs/Image, or CompressedImage with -p image_transport:=compressed
+  source/camera_info, target/camera_info  sensor_msgs/CameraInfo
+  source/depth, target/depth              depth registered to the image: 16UC1 millimetres or 32FC1 metres
+  ~/prior                                 geometry_msgs/PoseWithCovarianceStamped: source in target, if known (optional)
+Publishes
+  ~/pose          geometry_msgs/PoseStamped: pose of the source camera in the target's optical frame
+  ~/odometry      nav_msgs/Odometry: the same with covariance and both frame names
+  ~/source_cloud, ~/target_cloud  sensor_msgs/PointCloud2 in the target frame, while subscribed to
+  /diagnostics    diagnostic_msgs/DiagnosticArray, once a second: what is missing, rejected, how long it takes
+Services
+  ~/reset (std_srvs/Trigger), ~/enable (std_srvs/SetBool)
+Parameters: docs/parameters.md, config/garps.yaml, or `ros2 param describe /pose_node NAME`; numbers with a point: 5.0
+
+examples:
+  ros2 run garps_ros pose_node --ros-args -r source/image:=/right/image_rect -r target/image:=/left/image_rect \\
+      -r source/camera_info:=/right/camera_info -r target/camera_info:=/left/camera_info \\
+      -r source/depth:=/right/depth -r target/depth:=/left/depth
+  ros2 run garps_ros pose_node --ros-args -p pairing:=keyframe -r source/image:=/camera/color/image_raw ...
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node until a signal; returns the exit code."""
+    words = sys.argv if arguments is None else [NAME, *arguments]
+    if {"-h", "--help"} & set(words[1:]):
+        print(HELP, end="")
+        return 0
+    stopped = _stop_on_signals()  # before anything heavy is imported: a signal may come at any time
+    try:
+        import rclpy
+    except ImportError as error:
+        return _refuse(f"rclpy is not there ({error}): source /opt/ros/jazzy/setup.bash, or see requirements-ros.txt")
+    from garps_core.errors import ConfigError
+
+    try:
+        rclpy.init(args=words, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        unknown = rclpy.utilities.remove_ros_args(words)[1:]
+        if unknown:
+            return _refuse(f"unknown argument {unknown[0]!r}: expected --help or --ros-args ...")
+        return _run(stopped)
+    except ConfigError as error:
+        return _refuse(str(error))
+    except (RuntimeError, ValueError) as error:  # ROS arguments that cannot be parsed
+        if stopped:
+            return 0
+        return _refuse(str(error))
+    finally:
+        rclpy.try_shutdown()
+
+
+def _run(stopped: list[int]) -> int:
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+
+    from garps_ros.node import PoseNode
+
+    executor, ros = SingleThreadedExecutor(), Node(NAME)
+    node = PoseNode(ros)
+    executor.add_node(ros)
+    while not stopped:
+        try:
+            executor.spin_once(timeout_sec=SPIN_S)
+        except Exception as error:
+            node.failed(error, traceback.format_exc())
+    ended = node.stop(PATIENCE_S)
+    executor.shutdown()
+    ros.destroy_node()
+    if not ended:  # the computation goes on in native code; the interpreter cannot be taken down under it
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
+    return 0
+
+
+def _stop_on_signals() -> list[int]:
+    """From now on the first SIGINT or SIGTERM is only noted in the list; the second ends the process at once."""
+    received: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        if received:
+            os._exit(128 + number)
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, note)
+    return received
+
+
+def _refuse(reason: str) -> int:
+    print(f"{NAME}: error: {' '.join(reason.split())}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

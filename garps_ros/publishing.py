@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the live node publishes: pose, odometry, clouds, diagnostics. Only the executor's thread comes here."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+
+from garps_core.checks import Float64Array
+from garps_ros.estimates import Outcome
+from garps_ros.health import Finding
+from garps_ros.inputs import SIDES
+from garps_ros.solver import Cloud
+from garps_ros.transforms import Transforms
+from msg_adapters import CloudWriter, PoseWriter
+
+QOS = QoSProfile(depth=10)  # reliable, keep last, volatile: what navigation subscribes to
+CLOUD_QOS = QoSProfile(depth=1)
+
+
+@functools.cache
+def message_class(name: str) -> Any:
+    """The rclpy class of a full message name, e.g. "geometry_msgs/msg/Pose"."""
+    package, _, kind = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+class Publishing:
+    """The node's publishers.
+
+    Args:
+        node: to publish with.
+        transforms: also publish on /tf.
+        say: called with a line when a transform cannot be published.
+    """
+
+    def __init__(self, node: Node, transforms: bool, say: Callable[[str], None]) -> None:
+        self._node = node
+        self._pose = node.create_publisher(PoseStamped, "~/pose", QOS)
+        self._odometry = node.create_publisher(Odometry, "~/odometry", QOS)
+        self._clouds = [node.create_publisher(PointCloud2, f"~/{name}_cloud", CLOUD_QOS) for name in SIDES]
+        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QOS)
+        self._poses, self._points = PoseWriter(message_class), CloudWriter(message_class)
+        self._transforms: Transforms | None = None
+        if transforms:
+            try:
+                self._transforms = Transforms(node, self._poses, say)
+            except ImportError as error:
+                say(f"publish_tf has no effect: {error}; install tf2_msgs (apt: ros-jazzy-tf2-msgs)")
+
+    @property
+    def wanted(self) -> bool:
+        """True while somebody subscribes to a result."""
+        publishers = (self._pose, self._odometry, *self._clouds)
+        return self._transforms is not None or any(p.get_subscription_count() for p in publishers)
+
+    @property
+    def clouds_wanted(self) -> bool:
+        """True while somebody subscribes to a cloud."""
+        return any(publisher.get_subscription_count() for publisher in self._clouds)
+
+    def publish(self, outcome: Outcome, T: Float64Array, covariance: Float64Array) -> str:
+        """Publish a pose (4x4, m) with its covariance (6x6, ROS meaning), stamped with the source image's time.
+
+        Returns:
+            What became of the transform, for the diagnostics.
+        Raises:
+            MessageError: a pose or covariance that must not be published; nothing is published then.
+        """
+        stamp_ns, frame_id = outcome.row.source_stamp_ns, outcome.frame_id
+        odometry = self._poses.odometry(T, covariance, stamp_ns, frame_id, outcome.child_frame_id)
+        self._pose.publish(self._poses.pose_stamped(T, stamp_ns, frame_id))
+        self._odometry.publish(odometry)
+        if self._transforms is None:
+            return "off"
+        return self._transforms.send(T, stamp_ns, frame_id, outcome.child_frame_id) or "published"
+
+    def show(self, clouds: tuple[Cloud, Cloud], outcome: Outcome) -> None:
+        """Publish the source and target clouds to those that are subscribed to."""
+        for publisher, cloud in zip(self._clouds, clouds, strict=True):
+            if publisher.get_subscription_count():
+                stamp_ns = outcome.row.source_stamp_ns
+                publisher.publish(self._points.point_cloud(cloud.points, cloud.colours, stamp_ns, outcome.frame_id))
+
+    def report(self, findings: Iterable[Finding]) -> None:
+        """Publish findings on /diagnostics, each named after the node."""
+        name = self._node.get_fully_qualified_name().lstrip("/")
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [_status(f"{name}: {finding.name}", name, finding) for finding in findings]
+        self._diagnostics.publish(message)
+
+
+def _status(full_name: str, hardware: str, finding: Finding) -> DiagnosticStatus:
+    values = [KeyValue(key=str(key), value=str(value)) for key, value in finding.values.items()]
+    return DiagnosticStatus(
+        level=bytes([int(finding.level)]),
+        name=full_name,
+        message=str(finding.message),
+        hardware_id=hardware,
+        values=values,
+    )

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the worker of the live node computes: messages that belong together -> outcomes, in the offline replay's way."""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from garps_core.align import estimate_relative_pose
+from garps_core.checks import Float64Array
+from garps_core.config import Config
+from garps_core.geometry import se3_inverse
+from garps_core.reconstruct import reconstruct
+from garps_core.types import PoseEstimate, Prior, View
+from garps_ros.cameras import Frame
+from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_pair, failed_outcome, follow_frame, frame_names
+from garps_ros.priors import prior_from_message
+from garps_ros.settings import NodeSettings
+from garps_ros.tracking import KeyframeRule, KeyframeTracker
+from msg_adapters import MessageError
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One pair of frames, or one frame to follow, and all that its computation depends on.
+
+    Args:
+        frames: (source, target), or (source,) to be followed against its keyframe.
+        settings, config: as they were when the frames became complete.
+        epoch: counts resets and jumps back in time; a keyframe of another epoch is forgotten.
+        generation: counts everything that makes earlier results stale; a result of another generation is dropped.
+        arrived_s: steady time at which the newest of the messages came.
+        prior: PoseWithCovarianceStamped for this pair, or None.
+        clouds: also make the point clouds.
+    """
+
+    frames: tuple[Frame, ...]
+    settings: NodeSettings
+    config: Config
+    epoch: int = 0
+    generation: int = 0
+    arrived_s: float = 0.0
+    prior: Any = None
+    clouds: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points (Nx3 float32, m) with colours (Nx3 uint8)."""
+
+    points: npt.NDArray[np.float32]
+    colours: npt.NDArray[np.uint8]
+
+
+@dataclass(eq=False)
+class Result:
+    """What came of a job."""
+
+    job: Job
+    outcomes: list[Origin | Outcome] = field(default_factory=list)
+    core_s: float = 0.0
+    """Time inside `estimate_relative_pose`, all attempts together, s."""
+    prior_refused: str = ""
+    """Why the prior was not used; empty when it was, or when there was none."""
+    used_prior: bool = False
+    clouds: tuple[Cloud, Cloud] | None = None
+    """Source and target, both in the target frame, when asked for and when there is a pose."""
+    trace: str = ""
+    """Of an error that nobody expected."""
+    keyframes: int = 0
+
+
+class Solver:
+    """Computes jobs one after the other; keeps the keyframe between them.
+
+    Args:
+        say: called, in the worker's thread, with a line for people.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._reader = ViewReader("auto", say)
+        self._tracker: KeyframeTracker | None = None
+        self._epoch = -1
+        self._job: Job
+        self._result: Result
+        self._prior: Prior | None = None
+        self._seen: tuple[View, View, PoseEstimate] | None = None
+        self.stage = ""
+        """What the thread does at present; "" between jobs."""
+
+    def __call__(self, job: Job) -> Result:
+        """Compute a job. An error that nobody expected becomes an outcome with status core_error, and its trace."""
+        self._job, self._result, self._seen, self._prior = job, Result(job), None, None
+        self._reader.rectified, self._reader.allow_resized = job.settings.rectified, job.settings.allow_resized
+        result = self._result
+        with self._in_stage("decode"):
+            try:
+                for outcome in self._outcomes():
+                    result.outcomes.append(self._renamed(outcome))
+                if job.clouds and result.outcomes:
+                    result.clouds = self._clouds(result.outcomes[-1])
+            except Exception as error:
+                result.trace = traceback.format_exc()
+                result.outcomes.append(failed_outcome(job.frames, error))
+        return result
+
+    def _outcomes(self) -> Iterator[Origin | Outcome]:
+        frames = self._job.frames
+        if len(frames) == 2:
+            self._read_prior()
+            yield estimate_pair(frames[0], frames[1], self._reader, self._estimate)
+            return
+        yield from follow_frame(frames[0], self._reader, self._followed())
+        self._result.keyframes = self._followed().keyframes
+
+    def _followed(self) -> KeyframeTracker:
+        settings = self._job.settings
+        rule = KeyframeRule(
+            settings.keyframe_overlap, settings.keyframe_motion, math.radians(settings.keyframe_rotation)
+        )
+        if self._tracker is None or self._epoch != self._job.epoch:
+            self._tracker, self._epoch = KeyframeTracker(self._estimate, rule), self._job.epoch
+        self._tracker.rule = rule
+        return self._tracker
+
+    def _read_prior(self) -> None:
+        if self._job.prior is None:
+            return
+        try:
+            target_frame = self._job.settings.target_frame or frame_names(self._job.frames[0], self._job.frames[1])[1]
+            self._prior = prior_from_message(self._job.prior, target_frame)
+            self._result.used_prior = True
+        except MessageError as error:
+            self._result.prior_refused = str(error)
+
+    def _estimate(self, source: View, target: View) -> PoseEstimate:
+        began = time.perf_counter()
+        with self._in_stage("estimate"):
+            found = estimate_relative_pose(source, target, self._job.config, self._prior)
+        self._result.core_s += time.perf_counter() - began
+        self._seen = source, target, found
+        return found
+
+    def _renamed(self, outcome: Origin | Outcome) -> Origin | Outcome:
+        """With the frame names that the settings ask for."""
+        settings = self._job.settings
+        segment = outcome.segment if isinstance(outcome, Origin) else outcome.row.segment
+        target = settings.target_frame and settings.target_frame + (f"_{segment}" if segment > 1 else "")
+        return replace(
+            outcome,
+            frame_id=target or outcome.frame_id,
+            child_frame_id=settings.source_frame or outcome.child_frame_id,
+        )
+
+    def _clouds(self, outcome: Origin | Outcome) -> tuple[Cloud, Cloud] | None:
+        """Both clouds in the frame of the outcome; with a keyframe that is not the keyframe's own."""
+        if isinstance(outcome, Origin) or outcome.T is None or self._seen is None:
+            return None
+        source, target, found = self._seen
+        if found.T_target_source is None:
+            return None
+        with self._in_stage("clouds"):
+            T_frame_target = outcome.T @ se3_inverse(found.T_target_source)
+            return self._cloud(source, outcome.T), self._cloud(target, T_frame_target)
+
+    def _cloud(self, view: View, T: Float64Array) -> Cloud:
+        mixture = reconstruct(view, self._job.config)
+        points = mixture.means @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+        return Cloud(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))
+
+    @contextmanager
+    def _in_stage(self, name: str) -> Iterator[None]:
+        before, self.stage = self.stage, name
+        try:
+            yield
+        finally:
+            self.stage = before

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscriptions that ask for what the publishers offer, store references only, and know why nothing arrives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from garps_ros.arrivals import Arrivals
+from garps_ros.health import InputState
+
+DEPTH = 10
+"""Messages that wait for the executor; at 30 Hz a third of a second."""
+
+
+class Input:
+    """One input topic.
+
+    Args:
+        node: to subscribe with.
+        role: name for people, "source/image".
+        kind: message class.
+        topic: as the node would write it, before remapping; or a full name.
+        reliability: "auto" (as the publishers offer), "reliable" or "best_effort".
+        received: called with every message.
+        say: called with a line when QoS does not match.
+        once: one message is enough (a calibration); then a latched one is asked for where it is offered.
+        optional: nothing is wrong when nothing comes.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        role: str,
+        kind: type,
+        topic: str,
+        reliability: str,
+        received: Callable[[Any], None],
+        say: Callable[[str], None],
+        once: bool = False,
+        optional: bool = False,
+    ) -> None:
+        self._node, self._role, self._kind, self._topic = node, role, kind, topic
+        self._reliability, self._received, self._say = reliability, received, say
+        self._once, self._optional = once, optional
+        self.topic = node.resolve_topic_name(topic)
+        self.arrivals = Arrivals()
+        self._publishers = 0
+        self._problem = ""
+        # Until a publisher is there: best effort hears everyone.
+        self._qos = _profile(reliability == "reliable", latched=False)
+        self._subscription = self._subscribe()
+
+    def follow_offers(self) -> None:
+        """Look at the publishers; subscribe anew where another QoS suits them better. Cheap; call it once a second."""
+        offers = self._node.get_publishers_info_by_topic(self.topic)
+        self._publishers = len(offers)
+        self._problem = self._type_problem(offers) or self._qos_problem(offers)
+        if not offers:
+            return
+        reliable = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+        latched = all(offer.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+        if self._reliability != "auto":
+            reliable = self._reliability == "reliable"
+        wanted = _profile(reliable, latched and reliable and self._once)
+        if (wanted.reliability, wanted.durability) != (self._qos.reliability, self._qos.durability):
+            self._node.destroy_subscription(self._subscription)
+            self._qos = wanted
+            self._subscription = self._subscribe()
+
+    def state(self) -> InputState:
+        """For the diagnostics."""
+        qos = self._qos.reliability.name + (", TRANSIENT_LOCAL" if _is_latched(self._qos) else "")
+        return InputState(
+            self._role, self.topic, self.arrivals, self._publishers, qos, self._problem, self._once, self._optional
+        )
+
+    def _subscribe(self) -> Any:
+        events = SubscriptionEventCallbacks(incompatible_qos=self._incompatible)
+        return self._node.create_subscription(self._kind, self._topic, self._arrived, self._qos, event_callbacks=events)
+
+    def _arrived(self, message: Any) -> None:
+        stamp = message.header.stamp
+        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        self.arrivals.note(time.monotonic(), stamp_ns, self._node.get_clock().now().nanoseconds)
+        self._received(message)
+
+    def _incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        self._say(
+            f"{self._role}: a publisher on {self.topic} offers a QoS that does not match {self._qos.reliability.name} "
+            f"({event.total_count} so far): nothing will arrive from it; set image_qos to auto or best_effort"
+        )
+
+    def _qos_problem(self, offers: list[Any]) -> str:
+        asked = self._qos.reliability == ReliabilityPolicy.RELIABLE and self._reliability == "reliable"
+        weak = [offer for offer in offers if offer.qos_profile.reliability != ReliabilityPolicy.RELIABLE]
+        if not (asked and weak):
+            return ""
+        return f"incompatible QoS: {weak[0].node_name} offers BEST_EFFORT, image_qos asks for RELIABLE; set it to auto"
+
+    def _type_problem(self, offers: list[Any]) -> str:
+        package, kind = self._kind.__module__.split(".")[0], self._kind.__name__
+        wanted = f"{package}/msg/{kind}"
+        others = [offer for offer in offers if offer.topic_type != wanted]
+        if not others or len(others) < len(offers):
+            return ""
+        return (
+            f"{others[0].node_name} publishes {others[0].topic_type}, expected {wanted}; "
+            "check the remapping, image_transport and depth_transport"
+        )
+
+
+def _profile(reliable: bool, latched: bool) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _is_latched(qos: QoSProfile) -> bool:
+    return bool(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose as a transform on /tf, when asked for: only if nobody else says where the camera is."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from garps_core.checks import Float64Array
+from msg_adapters import PoseWriter
+
+QOS = QoSProfile(depth=100)  # as tf2_ros
+STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MOST_FRAMES = 10_000
+
+
+class Transforms:
+    """Publishes transforms on /tf and listens there, so that no frame ever gets a second parent.
+
+    Args:
+        node: to publish with.
+        poses: makes the messages.
+        say: called with a line when a transform is refused.
+    Raises:
+        ImportError: tf2_msgs is not installed.
+    """
+
+    def __init__(self, node: Node, poses: PoseWriter, say: Callable[[str], None]) -> None:
+        kind = importlib.import_module("tf2_msgs.msg").TFMessage  # part of ROS, but not of every installation
+        self._message, self._poses, self._say = kind, poses, say
+        self._parents: dict[str, str] = {}
+        self._publisher = node.create_publisher(kind, "/tf", QOS)
+        node.create_subscription(kind, "/tf", self._heard, QOS)
+        node.create_subscription(kind, "/tf_static", self._heard, STATIC_QOS)
+
+    def send(self, T: Float64Array, stamp_ns: int, frame_id: str, child_frame_id: str) -> str:
+        """Publish T (4x4, m) as frame_id -> child_frame_id; returns why not, "" when it was."""
+        parent = self._parents.get(child_frame_id, frame_id)
+        if parent != frame_id:
+            reason = (
+                f"{child_frame_id} already has the parent {parent}: not published with the parent {frame_id}; "
+                "set source_frame to another name"
+            )
+            self._say(reason)
+            return reason
+        transform = self._poses.transform_stamped(T, stamp_ns, frame_id, child_frame_id)
+        self._publisher.publish(self._message(transforms=[transform]))
+        return ""
+
+    def _heard(self, message: Any) -> None:
+        for transform in message.transforms:
+            child = transform.child_frame_id
+            if child in self._parents or len(self._parents) < MOST_FRAMES:
+                self._parents[child] = transform.header.frame_id

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One thread that computes, fed through a slot that holds the newest job only: never behind, never blocking."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+class Worker(Generic[Job, Result]):
+    """Computes jobs in its own thread, the newest first; older ones that still wait are dropped.
+
+    Args:
+        compute: from a job to its result; runs in the thread. Expected failures are results, not exceptions: one
+            that escapes ends the thread, which `death` then says; `restart` begins a new one.
+        finished: called in the thread when a result is ready to be taken; must not raise.
+    """
+
+    def __init__(self, compute: Callable[[Job], Result], finished: Callable[[], None]) -> None:
+        self._compute, self._finished = compute, finished
+        self._changed = threading.Condition()
+        self._waiting: Job | None = None
+        self._stopped = False
+        self._busy_since: float | None = None
+        self._results: deque[Result] = deque()
+        self.min_period_s = 0.0
+        """Jobs begin at least this far apart, s."""
+        self.death = ""
+        """Why the thread ended although nobody stopped it; empty while it lives."""
+        self._begin()
+
+    def offer(self, job: Job) -> bool:
+        """Leave a job for the thread; True when it took the place of one that had not begun."""
+        with self._changed:
+            replaced, self._waiting = self._waiting is not None, job
+            self._changed.notify_all()
+        return replaced
+
+    def withdraw(self) -> bool:
+        """Take back the job that has not begun; True when there was one."""
+        with self._changed:
+            waited, self._waiting = self._waiting is not None, None
+        return waited
+
+    def take(self) -> list[Result]:
+        """The results since the last call, oldest first."""
+        results = []
+        while self._results:
+            results.append(self._results.popleft())
+        return results
+
+    @property
+    def busy_s(self) -> float:
+        """How long the present job has been running, s; 0 when idle."""
+        since = self._busy_since
+        return 0.0 if since is None else time.monotonic() - since
+
+    def restart(self) -> None:
+        """A new thread after `death`."""
+        self.death, self._busy_since = "", None
+        self._begin()
+
+    def stop(self, timeout_s: float) -> bool:
+        """Ask the thread to end after the job at hand and wait for it; False when it still runs after the timeout."""
+        with self._changed:
+            self._stopped, self._waiting = True, None
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _begin(self) -> None:
+        # A daemon: a computation that hangs must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="garps-worker", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        not_before = 0.0
+        try:
+            while (job := self._next(not_before)) is not None:
+                self._busy_since = time.monotonic()
+                not_before = self._busy_since + self.min_period_s
+                self._results.append(self._compute(job))
+                self._busy_since = None
+                self._finished()
+        except BaseException as error:  # also SystemExit and MemoryError: whoever watches must know
+            self.death = f"{type(error).__name__}: {error}"
+            self._finished()
+
+    def _next(self, not_before: float) -> Job | None:
+        """The newest job, not before a time; None when stopped."""
+        with self._changed:
+            while not self._stopped:
+                due_in = not_before - time.monotonic()
+                if self._waiting is not None and due_in <= 0:
+                    job, self._waiting = self._waiting, None
+                    return job
+                self._changed.wait(due_in if self._waiting is not None else None)
+        return None
