@@ -83,7 +83,8 @@ def _checked_depth(depth: Any, size: tuple[int, int]) -> Float32Array:
         clean = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
     readings = clean[np.isfinite(clean)]
     if readings.size:
-        _check_depth_scale(float(np.median(readings)))
+        sample = readings[:: max(1, readings.size // 10_000)]  # enough to tell millimetres from metres
+        _check_depth_scale(float(np.median(sample)))
     return clean
 
 

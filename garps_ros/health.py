@@ -83,6 +83,7 @@ class Health:
     facts: dict[str, str] = field(default_factory=dict)
     """Of the last estimate: overlap, keyframe, prior."""
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    waiting_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     core_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     _seen: dict[str, int] = field(default_factory=dict)
 
@@ -101,22 +102,27 @@ class Health:
         self.errors[kind] += 1
         self.last_error = f"{kind}: {reason}"
 
-    def publish(self, latency_s: float, core_s: float) -> None:
+    def publish(self, latency_s: float, waiting_s: float, core_s: float) -> None:
         """Count a pose that was published.
 
         Args:
             latency_s: from the arrival of the newest message to publication, s.
+            waiting_s: of it for the worker to become free, s.
             core_s: of it inside the estimator, s.
         """
         self.used += 1
         self.last_status = "converged"
-        self.latencies_s.append(latency_s)
-        self.core_s.append(core_s)
+        for durations, seconds in (
+            (self.latencies_s, latency_s),
+            (self.waiting_s, waiting_s),
+            (self.core_s, core_s),
+        ):
+            durations.append(seconds)
 
     def inputs(self, states: Iterable[InputState], now_s: float, timeout_s: float, waiting: str) -> Finding:
         """The verdict on the inputs; `waiting` names what the clock waits for, "" when it runs."""
         states = list(states)
-        troubles = [trouble for state in states if (trouble := _trouble(state, now_s, timeout_s))]
+        troubles = _troubles(states, now_s, timeout_s)
         lossy = [state for state in states if not state.once and state.arrivals.missing() > MANY_MISSING]
         fresh = self._grown("refused", self.refused.total())
         level, message = Level.OK, "all inputs arrive"
@@ -175,12 +181,13 @@ class Health:
     def _latency_values(self) -> dict[str, str]:
         if not self.latencies_s:
             return {}
-        latencies, core = 1000 * np.array(self.latencies_s), 1000 * np.array(self.core_s)
+        latencies, waiting, core = (1000 * np.array(s) for s in (self.latencies_s, self.waiting_s, self.core_s))
         return {
             "latency p50 (ms)": f"{np.percentile(latencies, 50):.1f}",
             "latency p95 (ms)": f"{np.percentile(latencies, 95):.1f}",
             "core p50 (ms)": f"{np.percentile(core, 50):.1f}",
-            "beyond core p50 (ms)": f"{np.percentile(latencies - core, 50):.1f}",
+            "waiting p50 (ms)": f"{np.percentile(waiting, 50):.1f}",
+            "overhead p50 (ms)": f"{np.percentile(latencies - waiting - core, 50):.1f}",
         }
 
     def _grown(self, name: str, count: int) -> int:
@@ -189,18 +196,23 @@ class Health:
         return count - before
 
 
-def _trouble(state: InputState, now_s: float, timeout_s: float) -> str:
-    """Why an input is missing, in one clause; "" when it is there."""
-    age = state.arrivals.age_s(now_s)
-    if state.problem:
-        return f"{state.role} ({state.topic}): {state.problem}"
-    if age is None:
-        if state.optional:
-            return ""
-        return f"{state.role}: nothing received on {state.topic}, {state.publishers} publisher(s)"
-    if age > timeout_s and not state.once:
-        return f"{state.role}: silent for {age:.1f} s on {state.topic}, {state.publishers} publisher(s)"
-    return ""
+def _troubles(states: list[InputState], now_s: float, timeout_s: float) -> list[str]:
+    """Why inputs are missing; those of one kind in one clause."""
+    troubles, never, silent = [], [], []
+    for state in states:
+        age = state.arrivals.age_s(now_s)
+        where = f"{state.role} ({state.topic}, {state.publishers} publisher(s))"
+        if state.problem:
+            troubles.append(f"{where}: {state.problem}")
+        elif age is None and not state.optional:
+            never.append(where)
+        elif age is not None and age > timeout_s and not state.once:
+            silent.append(f"{where} for {age:.1f} s")
+    if never:
+        troubles.append(f"nothing received yet: {', '.join(never)}")
+    if silent:
+        troubles.append(f"silent: {', '.join(silent)}")
+    return troubles
 
 
 def _loss(state: InputState) -> str:

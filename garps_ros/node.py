@@ -158,7 +158,8 @@ class PoseNode:
             self._reject("not_publishable", str(error))
             return
         self._health.facts["transform"] = note
-        self._health.publish(time.monotonic() - result.job.arrived_s, result.core_s)
+        arrived_s = result.job.arrived_s
+        self._health.publish(time.monotonic() - arrived_s, result.began_s - arrived_s, result.core_s)
         if result.clouds is not None:
             self._publishing.show(result.clouds, outcome)
 

@@ -66,6 +66,8 @@ class Result:
 
     job: Job
     outcomes: list[Origin | Outcome] = field(default_factory=list)
+    began_s: float = 0.0
+    """Steady time at which the computation began."""
     core_s: float = 0.0
     """Time inside `estimate_relative_pose`, all attempts together, s."""
     prior_refused: str = ""
@@ -99,7 +101,7 @@ class Solver:
 
     def __call__(self, job: Job) -> Result:
         """Compute a job. An error that nobody expected becomes an outcome with status core_error, and its trace."""
-        self._job, self._result, self._seen, self._prior = job, Result(job), None, None
+        self._job, self._result, self._seen, self._prior = job, Result(job, began_s=time.monotonic()), None, None
         self._reader.rectified, self._reader.allow_resized = job.settings.rectified, job.settings.allow_resized
         result = self._result
         with self._in_stage("decode"):
