@@ -52,6 +52,8 @@ setup(
         "console_scripts": [
             "garps = garps_core.cli:main",
             "garps-replay = garps_ros.replay:main",
+            # The names that `ros2 run garps_ros ...` shows.
+            "pose_node = garps_ros.pose_node:main",
             "replay = garps_ros.replay:main",
         ],
     },
