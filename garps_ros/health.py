@@ -86,6 +86,8 @@ class Health:
     waiting_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     core_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     _seen: dict[str, int] = field(default_factory=dict)
+    _complete_since_s: float | None = None
+    """Steady time since which every input has been arriving."""
 
     def refuse(self, topic: str, reason: str) -> None:
         """Count a message that cannot be used."""
@@ -123,6 +125,7 @@ class Health:
         """The verdict on the inputs; `waiting` names what the clock waits for, "" when it runs."""
         states = list(states)
         troubles = _troubles(states, now_s, timeout_s)
+        self._complete_since_s = None if troubles else self._complete_since_s or now_s
         lossy = [state for state in states if not state.once and state.arrivals.missing() > MANY_MISSING]
         fresh = self._grown("refused", self.refused.total())
         level, message = Level.OK, "all inputs arrive"
@@ -138,15 +141,20 @@ class Health:
         values["last refused"] = self.last_refused
         return Finding("inputs", level, message, values)
 
-    def estimates(self, idle: str, gaps_s: Mapping[str, float], slop_s: float, unpaired: bool) -> Finding:
-        """The verdict on what came of the inputs.
+    def estimates(
+        self, idle: str, gaps_s: Mapping[str, float], slop_s: float, now_s: float, timeout_s: float
+    ) -> Finding:
+        """The verdict on what came of the inputs; to be asked for after theirs.
 
         Args:
             idle: why nothing is computed on purpose; "" when it is.
             gaps_s: between newest stamps of streams that belong together, s.
             slop_s: the largest gap that pairs, s.
-            unpaired: inputs arrive, but for too long nothing has become complete.
+            now_s: steady time, s.
+            timeout_s: for so long inputs may arrive without any becoming complete.
         """
+        since_s = self._complete_since_s
+        unpaired = since_s is not None and now_s - max(since_s, self.last_pair_s or since_s) > timeout_s
         rejected = self._grown("rejected", self.rejected.total())
         used = self._grown("used", self.used)
         level, message = Level.OK, f"{used} pose(s) in the last second" if used else "waiting for images"

@@ -30,6 +30,7 @@ from garps_ros.worker import Worker
 from msg_adapters import MessageError
 
 NANOSECONDS = 1_000_000_000
+OFFERS_PERIOD_S = 0.2
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False)
 
 
@@ -47,7 +48,6 @@ class PoseNode:
         self._node, self._log = node, Log(node.get_logger())
         self._health, self._priors = Health(), Priors()
         self._enabled, self._epoch, self._generation = True, 0, 0
-        self._began_s = time.monotonic()
         self._parameters = NodeParameters(node, self._settings_changed)
         self._publishing = Publishing(node, self._parameters.node.publish_tf, partial(self._log.warn, "tf"))
         cameras = camera_topics(node, self._parameters.node)
@@ -60,7 +60,9 @@ class PoseNode:
         self._apply_settings()
         node.create_service(Trigger, "~/reset", self._reset)
         node.create_service(SetBool, "~/enable", self._enable)
-        node.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # the node's own clock may stand still, or jump
+        node.create_timer(OFFERS_PERIOD_S, self._follow_offers, clock=steady)
+        node.create_timer(1.0, self._every_second, clock=steady)
         node.get_clock().create_jump_callback(BACKWARDS, post_callback=self._clock_jumped)
         self._say_ready()
 
@@ -211,19 +213,18 @@ class PoseNode:
 
     # --- how it is doing --------------------------------------------------------------------------------------------
 
-    def _every_second(self) -> None:
-        self._revive()
+    def _follow_offers(self) -> None:
         for input_ in self._inputs:
             input_.follow_offers()
+
+    def _every_second(self) -> None:
+        self._revive()
         now_s, settings, idle = time.monotonic(), self._parameters.node, self._idle()
-        last_s = self._health.last_pair_s or self._began_s
         findings = [
             self._health.inputs(
                 [i.state() for i in self._inputs], now_s, settings.input_timeout, self._clock_trouble()
             ),
-            self._health.estimates(
-                idle, self._intake.gaps_s(), settings.sync_slop, now_s - last_s > settings.input_timeout
-            ),
+            self._health.estimates(idle, self._intake.gaps_s(), settings.sync_slop, now_s, settings.input_timeout),
             self._health.machine(self._solver.stage, self._worker.busy_s, settings.stage_timeout, self._machine()),
         ]
         self._publishing.report(findings)

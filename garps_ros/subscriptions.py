@@ -57,7 +57,7 @@ class Input:
         self._subscription = self._subscribe()
 
     def follow_offers(self) -> None:
-        """Look at the publishers; subscribe anew where another QoS suits them better. Cheap; call it once a second."""
+        """Look at the publishers; subscribe anew where another QoS suits them better. Cheap: call it often."""
         offers = self._node.get_publishers_info_by_topic(self.topic)
         self._publishers = len(offers)
         self._problem = self._type_problem(offers) or self._qos_problem(offers)
