@@ -9,9 +9,11 @@ import functools
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -285,3 +287,44 @@ def test_every_ros_package_that_is_used_is_declared() -> None:
 
 def folder_files(folder: str) -> list[Path]:
     return sorted((ROOT / folder).rglob("*.py"))
+
+
+def ros2_commands() -> list[list[str]]:
+    """Words of every `ros2 run` and `ros2 launch` of this package in README and docs."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    blocks = [
+        block for page in pages for block in re.findall(r"^```bash\n(.*?)^```$", page.read_text("utf-8"), re.M | re.S)
+    ]
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    words = [shlex.split(line, comments=True) for line in lines if line.startswith("ros2 ")]
+    return [line for line in words if line[1] in ("run", "launch") and line[2] == "garps_ros"]
+
+
+def test_the_commands_of_the_pages_are_right(description: list[Any]) -> None:
+    arguments = {action.name for action in description if isinstance(action, DeclareLaunchArgument)}
+    names = {parameter.name for parameter in parameters()} | {"use_sim_time"}
+    commands = ros2_commands()
+    assert {words[1] for words in commands} == {"run", "launch"}
+    for _, verb, _, target, *rest in commands:
+        if verb == "launch":
+            assert target == LAUNCH_FILE.name
+            given = {word.partition(":=")[0]: word.partition(":=")[2] for word in rest if word != "--show-args"}
+            assert set(given) <= arguments, given
+            started(description, **given)
+            continue
+        assert f'"{target} = garps_' in (ROOT / "setup.py").read_text("utf-8")
+        assert {name.partition(":=")[0] for flag, name in pairwise(rest) if flag == "-p"} <= names
+        topics = {f"/{name.partition(':=')[0]}" for flag, name in pairwise(rest) if flag == "-r"}
+        assert topics <= node_topics(), topics
+
+
+def test_messages_that_the_page_explains_exist() -> None:
+    """The table under "Nothing comes out" quotes what the node says."""
+    page = (ROOT / "docs" / "robot.md").read_text("utf-8").partition("## Nothing comes out")[2]
+    quoted = re.findall(r"^\| `([^`]+)` \|", page, re.M)
+    source = "\n".join(path.read_text("utf-8") for path in folder_files("garps_ros"))
+    literal = re.sub(r"\{[^{}]*\}", "...", source)
+    assert len(quoted) > 5
+    for text in quoted:
+        for part in text.split("..."):
+            assert part.strip(" ,") in literal, part
