@@ -19,7 +19,7 @@ MOST_FRAMES = 10_000
 
 
 class Transforms:
-    """Publishes transforms on /tf and listens there, so that no frame ever gets a second parent.
+    """Publishes transforms on /tf and listens there, so that no frame gets a second parent and no loop.
 
     Args:
         node: to publish with.
@@ -33,26 +33,44 @@ class Transforms:
         kind = importlib.import_module("tf2_msgs.msg").TFMessage  # part of ROS, but not of every installation
         self._message, self._poses, self._say = kind, poses, say
         self._parents: dict[str, str] = {}
+        self._own: set[tuple[str, str]] = set()
+        """(child, parent) as published here; they come back on /tf."""
         self._publisher = node.create_publisher(kind, "/tf", QOS)
         node.create_subscription(kind, "/tf", self._heard, QOS)
         node.create_subscription(kind, "/tf_static", self._heard, STATIC_QOS)
 
     def send(self, T: Float64Array, stamp_ns: int, frame_id: str, child_frame_id: str) -> str:
         """Publish T (4x4, m) as frame_id -> child_frame_id; returns why not, "" when it was."""
-        parent = self._parents.get(child_frame_id, frame_id)
-        if parent != frame_id:
-            reason = (
-                f"{child_frame_id} already has the parent {parent}: not published with the parent {frame_id}; "
-                "set source_frame to another name"
-            )
+        reason = self._objection(frame_id, child_frame_id)
+        if reason:
             self._say(reason)
             return reason
         transform = self._poses.transform_stamped(T, stamp_ns, frame_id, child_frame_id)
+        self._own.add((child_frame_id, frame_id))
         self._publisher.publish(self._message(transforms=[transform]))
         return ""
 
+    def _objection(self, frame_id: str, child: str) -> str:
+        """Why the transform would break the tree; "" when it would not."""
+        parent = self._parents.get(child, frame_id)
+        if parent != frame_id:
+            why = f"{child} already has the parent {parent}"
+        elif child in self._upwards(frame_id):
+            why = f"{frame_id} already hangs below {child}"
+        else:
+            return ""
+        return f"{why}: not published with the parent {frame_id}; set source_frame to another name"
+
+    def _upwards(self, frame_id: str) -> list[str]:
+        """A frame, its parent, the parent's parent and so on, as far as others have told."""
+        chain = [frame_id]
+        while (parent := self._parents.get(chain[-1])) is not None and parent not in chain:
+            chain.append(parent)
+        return chain
+
     def _heard(self, message: Any) -> None:
         for transform in message.transforms:
-            child = transform.child_frame_id
-            if child in self._parents or len(self._parents) < MOST_FRAMES:
-                self._parents[child] = transform.header.frame_id
+            child, parent = transform.child_frame_id, transform.header.frame_id
+            room = child in self._parents or len(self._parents) < MOST_FRAMES
+            if room and (child, parent) not in self._own:
+                self._parents[child] = parent
