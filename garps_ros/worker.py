@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -30,7 +31,7 @@ class Worker(Generic[Job, Result]):
         self._busy_since: float | None = None
         self._results: deque[Result] = deque()
         self.min_period_s = 0.0
-        """Jobs begin at least this far apart, s."""
+        """Jobs begin at least this far apart, s; a change counts from the next offer on."""
         self.death = ""
         """Why the thread ended although nobody stopped it; empty while it lives."""
         self._begin()
@@ -80,11 +81,10 @@ class Worker(Generic[Job, Result]):
         self._thread.start()
 
     def _run(self) -> None:
-        not_before = 0.0
+        begun_s = -math.inf
         try:
-            while (job := self._next(not_before)) is not None:
-                self._busy_since = time.monotonic()
-                not_before = self._busy_since + self.min_period_s
+            while (job := self._next(begun_s)) is not None:
+                self._busy_since = begun_s = time.monotonic()
                 self._results.append(self._compute(job))
                 self._busy_since = None
                 self._finished()
@@ -92,11 +92,11 @@ class Worker(Generic[Job, Result]):
             self.death = f"{type(error).__name__}: {error}"
             self._finished()
 
-    def _next(self, not_before: float) -> Job | None:
-        """The newest job, not before a time; None when stopped."""
+    def _next(self, begun_s: float) -> Job | None:
+        """The newest job, `min_period_s` after the one before has begun; None when stopped."""
         with self._changed:
             while not self._stopped:
-                due_in = not_before - time.monotonic()
+                due_in = begun_s + self.min_period_s - time.monotonic()
                 if self._waiting is not None and due_in <= 0:
                     job, self._waiting = self._waiting, None
                     return job
