@@ -36,8 +36,8 @@ class Priors:
         self._timed.clear()
 
     def near(self, stamp_ns: int, max_age_ns: int) -> Any:
-        """The message nearest in time, at most `max_age_ns` away; else the standing one; else None."""
-        nearest = min(self._timed, key=lambda timed: abs(timed[0] - stamp_ns), default=None)
+        """The message nearest in time, at most `max_age_ns` away (the latest of equals), else the standing one."""
+        nearest = min(reversed(self._timed), key=lambda timed: abs(timed[0] - stamp_ns), default=None)
         if nearest is not None and abs(nearest[0] - stamp_ns) <= max_age_ns:
             return nearest[1]
         return self._standing
