@@ -14,7 +14,7 @@ IMAGE, DEPTH = 0, 1
 JUMP_BACK_NS = 1_000_000_000
 """A stamp this much older than the newest of its stream is no late message: the recording began again."""
 STUBBORN = 10
-"""So many older stamps in a row on one stream mean the same (a recording shorter than the jump above)."""
+"""So many older stamps on one stream with no newer one between mean the same: a recording shorter than the jump."""
 
 
 class Intake:
@@ -86,7 +86,8 @@ class Intake:
     def _paired(self, index: int, role: int, stamp_ns: int, message: Any, topic: str) -> list[tuple[Any, Any]]:
         pairer = self._with_depth[index]
         behind_ns = pairer.latest[role] - stamp_ns
-        self._older[index, role] = self._older[index, role] + 1 if behind_ns > 0 else 0
+        if behind_ns:  # the end of a short recording that began again is the newest stamp once more
+            self._older[index, role] = self._older[index, role] + 1 if behind_ns > 0 else 0
         if behind_ns >= JUMP_BACK_NS or self._older[index, role] >= STUBBORN:
             self.forget()
             self._jumped(f"{topic}: time went back by {behind_ns * 1e-9:.3f} s")
