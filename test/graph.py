@@ -315,3 +315,45 @@ class Camera:
         if self._depth == "png":
             return ros_messages.compressed(file, "16UC1; png compressed ", "rclpy", **head)
         return ros_messages.compressed(bytes(12) + file, "16UC1; compressedDepth png", "rclpy", **head)
+
+
+class Rig:
+    """A source and a target camera that see one room pair at the same times.
+
+    Args:
+        peer: to publish with.
+        pair: what they see.
+        **how: of both cameras, see `Camera`.
+    """
+
+    def __init__(self, peer: Peer, pair: RoomPair, **how: Any) -> None:
+        self._peer = peer
+        self.source, self.target = (Camera(peer, side, pair, **how) for side in ("source", "target"))
+        self.stamp_ns = 1_700_000_000 * SECOND
+
+    def next_stamp(self, period_ns: int = SECOND // 10) -> int:
+        """A later time of acquisition."""
+        self.stamp_ns += period_ns
+        return self.stamp_ns
+
+    def publish(self) -> int:
+        """Publish a pair with a new stamp; returns that."""
+        stamp_ns = self.next_stamp()
+        self.source.publish(stamp_ns)
+        self.target.publish(stamp_ns)
+        return stamp_ns
+
+    def publish_until(
+        self, condition: Callable[[], Any], what: str, period_s: float = 0.1, seconds: float = PATIENCE_S
+    ) -> Any:
+        """Publish pair after pair until the condition is true; a first pair may meet no subscriber."""
+        due_s = 0.0
+
+        def published() -> Any:
+            nonlocal due_s
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + period_s
+                self.publish()
+            return condition()
+
+        return self._peer.wait(published, seconds, what)

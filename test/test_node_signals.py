@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGINT and SIGTERM end the node in good order, whatever it does at that moment: exit code 0, soon, no traceback."""
+
+import random
+import signal
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from graph import NodeProcess, Peer, Rig, private_domain, room_pair
+
+geometry_msgs = pytest.importorskip("geometry_msgs.msg")
+
+ROUNDS = 20
+SOON_S = 5.0
+NODES = {
+    "idle_int": (signal.SIGINT, False),
+    "idle_term": (signal.SIGTERM, False),
+    "busy_int": (signal.SIGINT, True),
+    "busy_term": (signal.SIGTERM, True),
+}
+CHEAP = ["-p", "lifting.stride:=4"]
+COSTLY = ["-p", "lifting.stride:=1", "-p", "alignment.solver:=adam"]  # 5 s for a pair
+
+
+class Stage:
+    """A domain with two cameras at 10 Hz and a listener to the poses of every node, for all tests."""
+
+    def __init__(self, domain, peer):
+        self.domain, self.peer = domain, peer
+        self.rig = Rig(peer, room_pair())
+        self.poses = {name: peer.collect(geometry_msgs.PoseStamped, f"/{name}/pose") for name in NODES}
+
+    def node(self, name: str, folder: Path, *settings: str) -> NodeProcess:
+        """A node of that name; an idle one hears of no camera."""
+        quiet = [] if NODES[name][1] else ["-r", "source/image:=/nothing", "-r", "target/image:=/nothing"]
+        self.poses[name].clear()
+        return NodeProcess(
+            ["--ros-args", "-r", f"__node:={name}", *quiet, *settings], self.domain.environment, folder / f"{name}.log"
+        )
+
+    def stream(self, seconds: float) -> None:
+        """Pairs at 10 Hz for so long."""
+        end = time.monotonic() + seconds
+        self.rig.publish_until(lambda: time.monotonic() > end, "the end")
+
+    def ended(self, *nodes: NodeProcess, seconds: float = SOON_S) -> None:
+        """Go on publishing until the nodes have ended, or as long as they may take."""
+        end = time.monotonic() + seconds
+        self.rig.publish_until(
+            lambda: all(node.process.poll() is not None for node in nodes) or time.monotonic() > end, "the end"
+        )
+        for node in nodes:
+            node.wait(0.01)
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    with private_domain(tmp_path_factory.mktemp("ros")) as domain, Peer(domain) as peer:
+        yield Stage(domain, peer)
+
+
+@pytest.mark.parametrize("turn", range(ROUNDS))
+def test_a_signal_ends_nodes_that_idle_and_nodes_that_compute(stage, tmp_path, turn):
+    """Four nodes at once: that is also how a machine under load looks."""
+    with ExitStack() as running:
+        nodes = {name: running.enter_context(stage.node(name, tmp_path, *CHEAP)) for name in NODES}
+        stage.rig.publish_until(
+            lambda: stage.poses["busy_int"] and stage.poses["busy_term"], "a pose of both busy nodes"
+        )
+        stage.peer.wait(lambda: all("ready" in node.log() for node in nodes.values()), what="all nodes to be ready")
+        assert not stage.poses["idle_int"] and not stage.poses["idle_term"]
+        stage.stream(random.Random(turn).uniform(0.0, 0.8))
+        for name, node in nodes.items():
+            node.signal(NODES[name][0])
+        stage.ended(*nodes.values())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_computation_that_takes_longer_is_not_waited_for(stage, tmp_path, number):
+    with stage.node("busy_int", tmp_path, *COSTLY) as node:
+        computing(stage, node)
+        node.signal(number)
+        stage.ended(node)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_it_at_once(stage, tmp_path, number):
+    node = stage.node("busy_int", tmp_path, *COSTLY)
+    computing(stage, node)
+    node.signal(number)
+    stage.stream(0.5)
+    assert node.process.poll() is None, "it ended before the second signal: nothing is tested here"
+    node.signal(number)
+    assert node.wait(1.0) == 128 + number
+    assert "Traceback" not in node.log()
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3, 0.8, 1.5])
+def test_a_signal_while_it_starts(stage, tmp_path, delay_s):
+    with stage.node("idle_int", tmp_path) as one, stage.node("idle_term", tmp_path) as two:
+        for node in (one, two):
+            stage.peer.wait(lambda node=node: catches(node, signal.SIGTERM), what="the handlers of the node")
+        stage.peer.spin(delay_s)
+        one.signal(signal.SIGINT)
+        two.signal(signal.SIGTERM)
+        for node in (one, two):
+            assert node.wait(20) == 0, node.log()
+
+
+def computing(stage: Stage, node: NodeProcess) -> None:
+    """Publish until the node says that it is in the middle of an estimate."""
+
+    def busy() -> bool:
+        _, _, values = stage.peer.diagnostics().get("busy_int: machine", (0, "", {}))
+        return values.get("stage") == "estimate"
+
+    stage.peer.diagnostics().clear()
+    stage.rig.publish_until(busy, "an estimate to be under way")
+
+
+def catches(node: NodeProcess, number: int) -> bool:
+    """True once the process has a handler of its own for the signal."""
+    status = Path(f"/proc/{node.process.pid}/status").read_text(encoding="ascii")
+    (mask,) = [line.split()[1] for line in status.splitlines() if line.startswith("SigCgt")]
+    return bool(int(mask, 16) >> (number - 1) & 1)
