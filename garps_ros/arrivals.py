@@ -10,6 +10,8 @@ import numpy as np
 WINDOW = 100
 """Arrivals that statistics look back on."""
 MANY_MISSING = 0.3
+PAUSE_S = 5.0
+"""A gap this long is no loss on the way: the publisher has paused."""
 
 
 class Arrivals:
@@ -31,7 +33,7 @@ class Arrivals:
         """
         self.count += 1
         self._times_s.append(now_s)
-        if self._stamps_s and stamp_ns * 1e-9 <= self._stamps_s[-1]:
+        if self._stamps_s and not 0 < stamp_ns * 1e-9 - self._stamps_s[-1] < PAUSE_S:
             self._stamps_s.clear()
         self._stamps_s.append(stamp_ns * 1e-9)
         if clock_ns:
