@@ -45,6 +45,7 @@ class Intake:
         self._unpaired_before = self.unpaired if hasattr(self, "_between") else 0
         self._with_depth = [Pairer(self.slop_ns) for _ in self._cameras]
         self._between = Pairer(self.slop_ns)
+        self._without_info: list[tuple[Any, Any] | None] = [None] * len(self._cameras)
         self._older = {(index, role): 0 for index in range(len(self._cameras)) for role in (IMAGE, DEPTH)}
 
     @property
@@ -64,9 +65,14 @@ class Intake:
             gaps[f"{a.image} and {b.image}"] = (self._between.latest[0] - self._between.latest[1]) * 1e-9
         return gaps
 
-    def add_info(self, index: int, message: Any) -> None:
-        """Keep the newest calibration of a camera."""
+    def add_info(self, index: int, message: Any) -> list[tuple[Frame, ...]]:
+        """Keep the newest calibration of a camera; returns what became complete, as `add`.
+
+        An image that came before the first calibration has waited for it.
+        """
         self._infos[index] = message
+        waiting, self._without_info[index] = self._without_info[index], None
+        return self._framed(index, *waiting) if waiting else []
 
     def add(self, index: int, role: int, message: Any) -> list[tuple[Frame, ...]]:
         """Take an image or depth of a camera; returns what became complete: (source, target), or (source,) alone."""
@@ -80,7 +86,7 @@ class Intake:
         pairs = self._paired(index, role, stamp_ns, message, topic)
         complete: list[tuple[Frame, ...]] = []
         for image, depth in pairs:
-            complete += self._framed(index, camera, image, depth)
+            complete += self._framed(index, image, depth)
         return complete
 
     def _paired(self, index: int, role: int, stamp_ns: int, message: Any, topic: str) -> list[tuple[Any, Any]]:
@@ -98,10 +104,13 @@ class Intake:
             self._refused(topic, f"header.stamp {stamp_ns} ns is not later than the one before: expected it to grow")
         return pairs or []
 
-    def _framed(self, index: int, camera: CameraTopics, image: Any, depth: Any) -> list[tuple[Frame, ...]]:
-        info = self._infos[index]
+    def _framed(self, index: int, image: Any, depth: Any) -> list[tuple[Frame, ...]]:
+        camera, info = self._cameras[index], self._infos[index]
         if info is None:
-            self._refused(camera.info, f"no camera_info yet for {camera.image}: its images are left out until it comes")
+            if self._without_info[index] is not None:
+                reason = f"no camera_info yet for {camera.image}: its images are left out until it comes"
+                self._refused(camera.info, reason)
+            self._without_info[index] = image, depth
             return []
         frame = Frame(camera, header_stamp_ns(image), image, depth, info)
         if len(self._cameras) == 1:

@@ -52,7 +52,7 @@ class PoseNode:
         self._publishing = Publishing(node, self._parameters.node.publish_tf, partial(self._log.warn, "tf"))
         cameras = camera_topics(node, self._parameters.node)
         self._intake = Intake(cameras, self._slop_ns, self._refused, self._forget)
-        takers = Takers(self._image, self._intake.add_info, self._prior, self._log.warn)
+        takers = Takers(self._image, self._info, self._prior, self._log.warn)
         self._inputs = subscribe(node, self._parameters.node, takers)
         self._ready = node.create_guard_condition(self._deliver)
         self._solver = Solver(self._log.info)
@@ -63,7 +63,8 @@ class PoseNode:
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the node's own clock may stand still, or jump
         node.create_timer(OFFERS_PERIOD_S, self._follow_offers, clock=steady)
         node.create_timer(1.0, self._every_second, clock=steady)
-        node.get_clock().create_jump_callback(BACKWARDS, post_callback=self._clock_jumped)
+        # The handle is kept: without it rclpy calls into freed memory when the clock jumps.
+        self._jump_handle = node.get_clock().create_jump_callback(BACKWARDS, post_callback=self._clock_jumped)
         self._say_ready()
 
     def stop(self, timeout_s: float) -> bool:
@@ -79,6 +80,10 @@ class PoseNode:
 
     def _image(self, index: int, role: int, message: Any) -> None:
         for frames in self._intake.add(index, role, message):
+            self._offer(frames)
+
+    def _info(self, index: int, message: Any) -> None:
+        for frames in self._intake.add_info(index, message):
             self._offer(frames)
 
     def _prior(self, message: Any) -> None:
