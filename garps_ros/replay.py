@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`garps-replay`: relative poses from a recording, offline and without ROS.
+"""`garps-replay`: relative poses from a recording, offline and without ROS; or the recording into a live ROS 2 graph.
 
 Exit code 0 = at least one pose, 1 = none, 2 = wrong input, 130 = interrupted (what was written is valid).
 """
@@ -36,6 +36,9 @@ INTERRUPTED = 130
 NANOSECONDS = 1_000_000_000
 ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
 ONE_OF_RECTIFIED = ("auto", "true", "false")
+GIVEN = "COMMANDLINE"
+LIVE_OPTIONS = {"rate", "loop", "topics", "wait"}
+"""What goes with --to-ros, and with nothing else."""
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
@@ -74,17 +77,35 @@ Writes into --out:
   poses.csv       every pair, also rejected ones, with status, reason, pose, covariance and overlap
   poses/          rosbag2 (MCAP) with /garps/pose and /garps/odometry
 \b
+With --to-ros nothing is estimated or written: the recording is played into a live ROS 2 graph, with /clock for nodes
+whose use_sim_time is true. That needs rclpy, but not rosbag2; ROS 1 recordings are played too.
+\b
 Examples:
   garps-replay walk/ --out walk_poses
   garps-replay rig.mcap --source-image /right/image_raw --target-image /left/image_raw
   garps-replay old.bag --pairing keyframe --set lifting.stride=4 --limit 20
+  garps-replay walk/ --to-ros --rate 0.5 --loop
+  garps-replay rig.mcap --to-ros --topics /left/image_raw --topics /left/camera_info --wait 0
 \b
 Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupted (what was written is valid).
+With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong input, 130 = interrupted.
 """
+
+ToRos = Annotated[bool, typer.Option("--to-ros", help="Play the recording into a live ROS 2 graph instead.")]
+Rate = Annotated[float, typer.Option(help="With --to-ros: seconds of the recording per second.", min=0.001, max=1000)]
+Loop = Annotated[bool, typer.Option("--loop", help="With --to-ros: again from the start until stopped.")]
+Topics = Annotated[
+    list[str] | None,
+    typer.Option("--topics", metavar="TOPIC", help="With --to-ros: play this one; repeat at will.  [default: all]"),
+]
+Wait = Annotated[
+    float, typer.Option(help="With --to-ros: longest wait for a subscriber of an image, seconds; 0 = none.", min=0)
+]
 
 
 @app.command(help=HELP)
 def replay(
+    context: typer.Context,
     bag: Annotated[Path, typer.Argument(help="rosbag2 folder, .mcap, .db3 or ROS 1 .bag file.", metavar="BAG")],
     out: Annotated[Path, typer.Option(help="Folder for the results; must be new or empty.")] = Path("garps_replay"),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier replay.")] = False,
@@ -113,8 +134,16 @@ def replay(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
+    to_ros: ToRos = False,
+    rate: Rate = 1.0,
+    loop: Loop = False,
+    topics: Topics = None,
+    wait: Wait = 10.0,
 ) -> int:
     """Replay; see HELP."""
+    _check_given(context, to_ros)
+    if to_ros:
+        return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
     _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
     config = changed_config(Config.preset(preset), set_ or [])
@@ -125,6 +154,28 @@ def replay(
         cameras = choose_cameras(recording, source, target, pairing)
         with Outputs(out, overwrite) as outputs:
             return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
+
+
+def _check_given(context: typer.Context, to_ros: bool) -> None:
+    """Options of the one way to replay do not go with the other."""
+    given = {name for name in context.params if getattr(context.get_parameter_source(name), "name", "") == GIVEN}
+    wrong = given - LIVE_OPTIONS - {"bag", "to_ros"} if to_ros else given & LIVE_OPTIONS
+    if wrong:
+        names = ", ".join(f"--{name.strip('_').replace('_', '-')}" for name in sorted(wrong))
+        allowed = ", ".join(f"--{name}" for name in sorted(LIVE_OPTIONS))
+        problem = f"cannot be used with --to-ros: expected only {allowed}" if to_ros else "needs --to-ros"
+        raise BagError(f"{names} {problem}")
+
+
+def _play(bag: Path, rate: float, loop: bool, topics: list[str], wait: float) -> int:
+    try:
+        from garps_ros.playback import play  # imports rclpy, which offline replay does without
+    except ImportError as error:
+        raise BagError(
+            f"--to-ros needs ROS 2 with rclpy ({error}): source it (source /opt/ros/jazzy/setup.bash), or without ROS, "
+            "on x86_64, pip install -r requirements-ros.txt"
+        ) from None
+    return play(bag, rate, loop, topics, wait)
 
 
 def _run(
