@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real ROS graph for tests: a domain of one's own, the node as a process, a peer that talks to it, and cameras.
+"""A real ROS graph for tests: a domain of one's own, a peer that talks to the node, and cameras.
 
 `with private_domain(folder) as domain, NodeProcess([...], domain.environment, log) as node, Peer(domain) as peer:`
 """
 
 import os
-import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 import ros_messages
+from node_process import PATIENCE_S, ROOT, NodeProcess, Nursery
 
 from bench.rooms import RoomPair, make_pair
 
@@ -36,12 +34,15 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-ROOT = Path(__file__).resolve().parent.parent
+__all__ = [
+    "PATIENCE_S", "SECOND", "SIZE", "Camera", "Domain", "NodeProcess", "Nursery", "Peer", "Rig", "Shot",
+    "private_domain", "room_pair",
+]  # fmt: skip
+
 FAST_DISCOVERY = ROOT / "test" / "fast_discovery.xml"
 FIRST_PORT = 21000
 """A domain is held by a listening socket on this port + its number."""
 DOMAINS = range(1, 102)  # beyond, DDS would use ports that Linux hands out to anybody
-PATIENCE_S = 30.0
 SIZE = (320, 240)
 SECOND = 1_000_000_000
 
@@ -83,64 +84,6 @@ def _held_number() -> Iterator[int]:
             yield number
             return
     pytest.fail(f"no free ROS domain: all ports {FIRST_PORT + 1}..{FIRST_PORT + len(DOMAINS)} are taken")
-
-
-class NodeProcess:
-    """A node in a process and session of its own, its output in a file.
-
-    As a context it ends the node with SIGINT and expects exit code 0 and no traceback.
-    """
-
-    def __init__(
-        self, arguments: Sequence[str], environment: dict[str, str], log: Path, module: str = "garps_ros.pose_node"
-    ) -> None:
-        self._log = log
-        with log.open("wb") as output:
-            command = [sys.executable, "-m", module, *arguments]
-            self.process = subprocess.Popen(
-                command, cwd=ROOT, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-            )
-
-    def __enter__(self) -> "NodeProcess":
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, _: Any) -> None:
-        if error is not None:
-            self._kill()
-            error.add_note(self._tail())
-            return
-        if self.process.poll() is None:
-            self.signal(signal.SIGINT)
-        code = self.wait()
-        assert code == 0, f"exit code {code}\n{self._tail()}"
-        assert "Traceback" not in self.log(), self._tail()
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the node alone, as a launch file does."""
-        self.process.send_signal(number)
-
-    def wait(self, seconds: float = 10.0) -> int:
-        """The exit code; on a hang it is made to say where it hangs, killed, and the test fails."""
-        try:
-            return self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            self._kill()
-        pytest.fail(f"node still runs {seconds:g} s after it was told to end\n{self._tail(100)}")
-
-    def log(self) -> str:
-        """What the node has written so far."""
-        return self._log.read_text(encoding="utf-8", errors="replace")
-
-    def _kill(self) -> None:
-        if self.process.poll() is None:
-            self.signal(signal.SIGABRT)  # faulthandler writes where every thread is
-            time.sleep(0.3)
-        with suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
-
-    def _tail(self, lines: int = 40) -> str:
-        return "\n".join([f"--- end of {self._log.name}:", *self.log().splitlines()[-lines:]])
 
 
 class Peer:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from graph import NodeProcess, Peer, Rig, private_domain, room_pair
+from graph import NodeProcess, Nursery, Peer, Rig, private_domain, room_pair
 
 geometry_msgs = pytest.importorskip("geometry_msgs.msg")
 
@@ -27,17 +27,20 @@ COSTLY = ["-p", "lifting.stride:=1", "-p", "alignment.solver:=adam"]  # 5 s for 
 class Stage:
     """A domain with two cameras at 10 Hz and a listener to the poses of every node, for all tests."""
 
-    def __init__(self, domain, peer):
-        self.domain, self.peer = domain, peer
+    def __init__(self, domain, peer, nursery):
+        self.domain, self.peer, self._nursery = domain, peer, nursery
         self.rig = Rig(peer, room_pair())
         self.poses = {name: peer.collect(geometry_msgs.PoseStamped, f"/{name}/pose") for name in NODES}
 
-    def node(self, name: str, folder: Path, *settings: str) -> NodeProcess:
-        """A node of that name; an idle one hears of no camera."""
+    def node(self, name: str, folder: Path, *settings: str, born: bool = False) -> NodeProcess:
+        """A node of that name, started anew or by the nursery; an idle one hears of no camera."""
         quiet = [] if NODES[name][1] else ["-r", "source/image:=/nothing", "-r", "target/image:=/nothing"]
         self.poses[name].clear()
         return NodeProcess(
-            ["--ros-args", "-r", f"__node:={name}", *quiet, *settings], self.domain.environment, folder / f"{name}.log"
+            ["--ros-args", "-r", f"__node:={name}", *quiet, *settings],
+            self.domain.environment,
+            folder / f"{name}.log",
+            nursery=self._nursery if born else None,
         )
 
     def stream(self, seconds: float) -> None:
@@ -57,15 +60,19 @@ class Stage:
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
-    with private_domain(tmp_path_factory.mktemp("ros")) as domain, Peer(domain) as peer:
-        yield Stage(domain, peer)
+    with (
+        private_domain(tmp_path_factory.mktemp("ros")) as domain,
+        Nursery(domain.environment) as nursery,
+        Peer(domain) as peer,
+    ):
+        yield Stage(domain, peer, nursery)
 
 
 @pytest.mark.parametrize("turn", range(ROUNDS))
 def test_a_signal_ends_nodes_that_idle_and_nodes_that_compute(stage, tmp_path, turn):
     """Four nodes at once: that is also how a machine under load looks."""
     with ExitStack() as running:
-        nodes = {name: running.enter_context(stage.node(name, tmp_path, *CHEAP)) for name in NODES}
+        nodes = {name: running.enter_context(stage.node(name, tmp_path, *CHEAP, born=True)) for name in NODES}
         stage.rig.publish_until(
             lambda: stage.poses["busy_int"] and stage.poses["busy_term"], "a pose of both busy nodes"
         )
