@@ -126,14 +126,37 @@ def test_pairs_are_those_of_the_replay_of_the_same_messages(tmp_path: Path):
     assert any(a != b for a, b in found) and any(a == b for a, b in found)
 
 
-def test_without_calibration_images_are_left_out_and_it_is_said():
+def waiting_for_calibration():
+    """An intake whose source camera has no calibration yet."""
     live = Live(calibrated=False)
     live.intake.add_info(TARGET, camera_info(size=(2, 2)))
-    assert live.pair(0) == []
-    ((topic, reason),) = live.refused
-    assert topic == "/source/info" and "no camera_info yet for /source/image" in reason
-    live.intake.add_info(SOURCE, camera_info(size=(2, 2)))
-    assert live.pair(PERIOD) == [(PERIOD, PERIOD)] and len(live.refused) == 1
+    return live
+
+
+def test_an_image_waits_for_the_first_calibration():
+    live = waiting_for_calibration()
+    assert live.pair(0) == [] and live.refused == []
+    first = camera_info(size=(2, 2))
+    ((source, target),) = live.intake.add_info(SOURCE, first)
+    assert source.stamp_ns == target.stamp_ns == START and source.info is first
+    assert live.intake.add_info(SOURCE, first) == [], "it waited once"
+    assert live.pair(PERIOD) == [(PERIOD, PERIOD)] and live.refused == []
+
+
+def test_older_images_without_calibration_are_left_out_and_it_is_said():
+    live = waiting_for_calibration()
+    assert [live.pair(number * PERIOD) for number in range(3)] == [[], [], []]
+    assert [topic for topic, _ in live.refused] == ["/source/info"] * 2
+    assert "no camera_info yet for /source/image" in live.refused[0][1]
+    ((source, target),) = live.intake.add_info(SOURCE, camera_info(size=(2, 2)))
+    assert source.stamp_ns == target.stamp_ns == START + 2 * PERIOD
+
+
+def test_an_image_from_before_a_jump_does_not_wait_for_its_calibration():
+    live = waiting_for_calibration()
+    live.frame(10 * SECOND)
+    live.add(0)
+    assert len(live.jumps) == 1 and live.intake.add_info(SOURCE, camera_info(size=(2, 2))) == []
 
 
 @pytest.mark.parametrize(("role", "topic"), [(IMAGE, "/target/image"), (DEPTH, "/target/depth")])
