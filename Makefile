@@ -15,7 +15,7 @@ export MPLBACKEND := Agg
 .DELETE_ON_ERROR:
 
 help:
-	@echo "make demo         real stereo pairs and a generated room; table and pictures in out/demo"
+	@echo "make demo         real stereo pairs, offline and live, and a generated room; tables and pictures in out/demo"
 	@echo "make test         everything continuous integration checks"
 	@echo "make bench        accuracy and time tables"
 	@echo "make test-numpy1  the tests on NumPy 1.26 and OpenCV 4 (what an apt robot has)"
@@ -59,9 +59,11 @@ $(VENV)/.core: requirements.txt setup.py
 	@touch $@
 
 # Only stereodemo's recorded images are used, so none of what its programs need, nor their Python versions, matters.
-$(VENV)/.demo: $(VENV)/.core
+$(VENV)/.demo: requirements-ros.txt $(VENV)/.core
 	$(PY) $(PIP) --no-deps --ignore-requires-python stereodemo==0.7
 	$(PY) $(PIP) "$$(grep '^trimesh==' requirements-test.txt)" "$$(grep '^embreex==' requirements-test.txt)"
+	@$(PY) $(PIP) -r requirements-ros.txt || \
+	  echo "make: note: no ROS 2 wheels for this machine (x86_64 only); the demo leaves out its live part" >&2
 	@touch $@
 
 $(VENV)/.test: requirements-test.txt requirements-ros.txt $(VENV)/.core

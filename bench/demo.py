@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m bench.demo`: GARPS on twelve recorded stereo pairs and in a generated room, with pictures.
+"""`python -m bench.demo`: GARPS on twelve recorded stereo pairs, offline and live, and in a generated room.
 
 1. Stereo: depth for both cameras by a stereo matcher, written to a rosbag2 as a robot would record it, replayed by
    `garps-replay`. The truth is the calibrated rig: baseline 75 mm, no rotation. (The depth was made with the same
    baseline: what is tested is the alignment, not the depth. The rectification is good to about 0.2 px, 0.03 deg.)
 2. Room: two views 0.6 m and 20 degrees apart with a depth sensor's noise; the truth is exact. Once from the images
    alone, once from a rough pose (0.12 m and 3 degrees off) as odometry would give it; that one is the picture.
+3. Live: `pose_node` in a process of its own, the stereo pairs played into it over ROS 2, its poses as they come.
+   Left out where rclpy is not installed.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +36,9 @@ from bench.stereo import StereoPair, depth_of_both, load_pairs
 from garps_core import PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.figure import before_after
 from garps_ros.replay import main as replay
+
+if TYPE_CHECKING:
+    from bench.demo_live import LivePose  # needs rclpy
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""
@@ -59,7 +64,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the bag, poses.csv and the pictures.")] = Path("out/demo"),
     scenes: Annotated[int, typer.Option(help="Use the first so many stereo pairs.", min=1)] = 12,
 ) -> int:
-    """Run both parts; exit code 0 when the median baseline error is below the limit."""
+    """Run all parts; exit code 0 when the median baseline error is below the limit, offline and live."""
     begin = time.perf_counter()
     try:
         load_pairs()
@@ -69,6 +74,7 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     good = stereo_part(out, scenes)
     room_part(out)
+    good &= live_part(out, scenes)
     console.print(f"\nEverything is in [bold]{out}[/bold]; {time.perf_counter() - begin:.0f} s.")
     return 0 if good else 1
 
@@ -216,6 +222,65 @@ def describe(name: str, estimate: PoseEstimate, truth: Array) -> None:
         f"sigma {sigma_mm(estimate.covariance):.1f} mm",
         soft_wrap=True,
     )
+
+
+def live_part(out: Path, scenes: int) -> bool:
+    """The stereo pairs played into the node; whether its poses are good, and true where there is no rclpy."""
+    console.rule("Live: the same pairs over ROS 2, into pose_node")
+    try:
+        from bench.demo_live import LiveError, run_live
+    except ImportError as error:
+        console.print(f"skipped: {error} (ROS 2 is not installed; its wheels are for x86_64 only)", soft_wrap=True)
+        return True
+    console.print(
+        f"$ python -m garps_ros.pose_node --ros-args ...; garps-replay {out / 'bag'} --to-ros", soft_wrap=True
+    )
+    try:
+        with console.status("the node starts, then gets a pair per second"):
+            poses, code = run_live(out / "bag", out / "live.log")
+    except LiveError as error:
+        console.print(f"demo: error: {error}", style="red", soft_wrap=True)
+        return False
+    return report_live(load_pairs()[:scenes], poses) and report_end(code)
+
+
+def report_live(pairs: list[StereoPair], poses: dict[int, LivePose]) -> bool:
+    """Print the poses and their medians; whether there are any and the median baseline error is below the limit."""
+    table = Table(title="What came on /pose_node/pose; truth: -75 0 0 mm, 0 deg", box=SIMPLE, padding=(0, 1, 0, 0))
+    for heading in ("scene", "x y z\nmm", "error\nmm", "error\ndeg", "baseline\noff by mm", "latency\nms"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading == "scene" else "right")
+    found = []
+    for index, pair in enumerate(pairs):
+        pose = poses.get(stamp_ns_of(index))
+        if pose is None:
+            table.add_row(pair.name, *["-"] * 5)
+            continue
+        millimetres, degrees = errors(pose.T, pair.T_right_left)
+        miss = 1000 * abs(float(np.linalg.norm(pose.T[:3, 3])) - pair.baseline_m)
+        found.append((miss, 1000 * pose.latency_s))
+        where = " ".join(f"{1000 * x:+.1f}" for x in pose.T[:3, 3])
+        numbers = f"{millimetres:.1f}", f"{degrees:.2f}", f"{miss:.1f}", f"{found[-1][1]:.0f}"
+        table.add_row(pair.name, where, *numbers)
+    console.print(table)
+    if not found:
+        console.print("[red]no pose came[/red]; see live.log")
+        return False
+    baseline, latency = (float(value) for value in np.median(found, axis=0))
+    verdict = "[green]good[/green]" if baseline < LIMIT_MM else "[red]too much[/red]"
+    if len(found) < len(pairs):
+        console.print("No pose: rejected, or the machine was busy with an older pair.")
+    console.print(
+        f"{len(found)} of {len(pairs)} pairs, median latency {latency:.0f} ms from the first message of a pair, "
+        f"median baseline error [bold]{baseline:.1f} mm[/bold] (expected below {LIMIT_MM:g}): {verdict}",
+        soft_wrap=True,
+    )
+    return baseline < LIMIT_MM
+
+
+def report_end(code: int) -> bool:
+    """Say how the node ended."""
+    console.print(f"pose_node ended on SIGINT with exit code {code}")
+    return code == 0
 
 
 if __name__ == "__main__":

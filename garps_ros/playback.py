@@ -40,8 +40,9 @@ LEAD_S = 0.1
 """Wall time that /clock runs before the first message."""
 LATE_S = 0.2
 """Wall time behind the recording from which on it is said."""
-SETTLE_S = 0.5
-"""A node's subscriptions are matched one after another: it is complete when nothing was added for so long."""
+SETTLE_S = 1.5
+"""How long nothing may be added before the listeners count as complete: subscriptions are matched one after another,
+and `pose_node`, which looks at the publishers once a second, then subscribes anew with the QoS that they offer."""
 PATIENCE_S = 3.0
 """The same while the graph shows more subscriptions than are matched; some never are, for their QoS."""
 DELIVERY_S = 5.0

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of `make demo`: depth of both cameras, and the bag they are written to."""
+"""The parts of `make demo`: depth of both cameras, the bag they are written to, and the node it is played into."""
 
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from rosbags.highlevel import AnyReader
 
+from bench import demo
 from bench.demo_bag import stamp_ns_of, write_bag
 from bench.stereo import StereoPair, depth_of_both
 from msg_adapters import depth_image, rgb_image
@@ -49,3 +52,30 @@ def test_the_bag_holds_what_was_put_in(tmp_path: Path) -> None:
     np.testing.assert_allclose(info.k.reshape(3, 3), K)
     assert info.p[3] == -300 * BASELINE_M
     assert messages["/left/camera_info"].header.frame_id == "left_optical"
+
+
+def test_the_node_finds_the_baseline_live_and_ends_well(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    from bench.demo_live import run_live
+
+    pair = fronto_parallel(12)
+    depths = depth_of_both(pair)
+    write_bag(tmp_path / "bag", [(pair, *depths)] * 4)
+    poses, code = run_live(tmp_path / "bag", tmp_path / "live.log")
+    log = (tmp_path / "live.log").read_text(encoding="utf-8")
+    assert code == 0 and "Traceback" not in log, log
+    assert poses and set(poses) <= {stamp_ns_of(index) for index in range(4)}, log
+    for pose in poses.values():
+        np.testing.assert_allclose(pose.T, pair.T_right_left, atol=0.01)
+        assert 0 < pose.latency_s < 10
+
+
+def test_a_machine_without_ros_leaves_the_live_part_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "bench.demo_live", raising=False)
+    for name in ("rclpy", "geometry_msgs.msg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert demo.live_part(tmp_path, 12)
+    shown = capsys.readouterr().out
+    assert "skipped:" in shown and "ROS 2 is not installed" in shown
