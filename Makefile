@@ -17,7 +17,7 @@ export MPLBACKEND := Agg
 help:
 	@echo "make demo         real stereo pairs, offline and live, and a generated room; tables and pictures in out/demo"
 	@echo "make test         everything continuous integration checks"
-	@echo "make bench        accuracy and time tables"
+	@echo "make bench        accuracy and time tables, cost of the live node"
 	@echo "make test-numpy1  the tests on NumPy 1.26 and OpenCV 4 (what an apt robot has)"
 	@echo "make clean        remove virtual environments, builds and outputs"
 
@@ -33,6 +33,7 @@ test: $(VENV)/.test
 bench: $(VENV)/.test
 	$(PY) -m bench.speed
 	$(PY) -m bench.rgbd
+	$(PY) -m bench.live
 
 test-numpy1: $(VENV1)/.test
 	$(PY1) -m pytest

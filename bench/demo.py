@@ -228,7 +228,8 @@ def live_part(out: Path, scenes: int) -> bool:
     """The stereo pairs played into the node; whether its poses are good, and true where there is no rclpy."""
     console.rule("Live: the same pairs over ROS 2, into pose_node")
     try:
-        from bench.demo_live import LiveError, run_live
+        from bench.demo_live import run_live
+        from bench.live_graph import LiveError
     except ImportError as error:
         console.print(f"skipped: {error} (ROS 2 is not installed; its wheels are for x86_64 only)", soft_wrap=True)
         return True
