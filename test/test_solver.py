@@ -321,10 +321,10 @@ def test_stage_and_times_are_those_of_the_work(monkeypatch):
     result = solve(*pair(), by=by, clouds=True)
     assert began <= result.began_s <= time.monotonic() - 0.1
     assert stages == ["decode", "decode", "estimate", "clouds", "clouds"] and by.stage == ""
-    assert 0.1 <= result.core_s < 0.19
+    assert 0.1 <= result.core_s < time.monotonic() - began
     results = [solve(frame(i), settings=KEYFRAME, by=by) for i in (1, 2, 3)]
     assert [len(r.outcomes) for r in results] == [1, 1, 2] and by.stage == ""
-    assert results[0].core_s == 0 and 0.1 <= results[1].core_s < 0.19 < results[2].core_s, "all attempts together"
+    assert results[0].core_s == 0 and results[1].core_s >= 0.1 and results[2].core_s >= 0.2, "all attempts together"
 
 
 # --- clouds -----------------------------------------------------------------------------------------------------------

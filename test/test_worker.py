@@ -222,8 +222,12 @@ def test_death_is_noted_and_told_and_a_new_thread_goes_on(error):
         assert worker.busy_s == 0
 
 
-def test_a_dead_worker_can_be_stopped():
+def test_a_dead_worker_can_be_restarted_and_stopped():
     with working(lambda job: 1 / job) as worker:
+        worker.offer(0)
+        assert eventually(lambda: worker.death)
+        worker.restart()
+        assert worker.busy_s == 0, "what died is over"
         worker.offer(0)
         assert eventually(lambda: worker.death)
         assert worker.stop(LIMIT_S) is True
