@@ -375,3 +375,11 @@ def test_clouds_are_made_when_asked_for_and_when_there_is_a_pose(monkeypatch, ca
     answering(monkeypatch, lambda *_: PoseEstimate(Status.POOR_FIT, "no", moved(0.1), COVARIANCE))
     bad = solve(*pair(), clouds=True)
     assert (bad.clouds, bad.trace, bad.outcomes[0].row.status) == (None, "", "poor_fit")
+
+
+def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
+    answering(monkeypatch, lambda s, t: recordings.estimate(s, t, bad=(3,) if recordings.index_of(t) == 1 else ()))
+    by = Solver(print)
+    follow(by, (1, 2))
+    result = solve(frame(3), settings=KEYFRAME, by=by, clouds=True)
+    assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
