@@ -31,6 +31,7 @@ from msg_adapters import MessageError
 
 NANOSECONDS = 1_000_000_000
 OFFERS_PERIOD_S = 0.2
+STALE = "stale: reset or settings changed"
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False)
 
 
@@ -131,7 +132,7 @@ class PoseNode:
         """Publish what the worker has finished."""
         for result in self._worker.take():
             if result.job.generation != self._generation:
-                self._health.dropped["stale: reset or settings changed"] += 1
+                self._health.dropped[STALE] += 1
                 continue
             self._report(result)
             for outcome in result.outcomes:
@@ -142,8 +143,7 @@ class PoseNode:
         facts = self._health.facts
         if result.keyframes:
             facts["keyframes"] = str(result.keyframes)
-        if result.job.prior is not None:
-            facts["prior"] = result.prior_refused or "used"
+        facts["prior"] = result.prior_refused or ("none" if result.job.prior is None else "used")
         if result.prior_refused:
             self._refused("prior", result.prior_refused)
         if result.trace:
@@ -198,9 +198,13 @@ class PoseNode:
         self._epoch += 1
         self._generation += 1
         self._priors.forget()
-        if self._worker.withdraw():
-            self._health.dropped["stale: reset or settings changed"] += 1
+        self._health.facts.clear()
+        self._withdraw()
         self._log.warn("forget", f"{why}: beginning anew")
+
+    def _withdraw(self) -> None:
+        if self._worker.withdraw():
+            self._health.dropped[STALE] += 1
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._intake.forget()
@@ -212,7 +216,7 @@ class PoseNode:
         self._enabled = bool(request.data)
         if not self._enabled:
             self._generation += 1
-            self._worker.withdraw()
+            self._withdraw()
         response.success, response.message = True, "enabled" if self._enabled else "disabled: nothing is published"
         return response
 

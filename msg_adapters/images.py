@@ -71,7 +71,9 @@ def rgb_image(message: Any) -> Rgb:
     if layout.bayer:
         pixels = _demosaiced(pixels[..., 0], layout.bayer)
     eight_bit = pixels if pixels.dtype == np.uint8 else ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    return np.ascontiguousarray(eight_bit if layout.bayer else eight_bit[..., list(layout.rgb)])
+    if layout.bayer or layout.rgb == tuple(range(layout.channels)):  # in order already: picking would cost a copy
+        return np.ascontiguousarray(eight_bit)
+    return np.ascontiguousarray(eight_bit[..., list(layout.rgb)])
 
 
 def depth_image(message: Any) -> Depth:
