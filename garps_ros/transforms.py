@@ -16,10 +16,12 @@ from msg_adapters import PoseWriter
 QOS = QoSProfile(depth=100)  # as tf2_ros
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MOST_FRAMES = 10_000
+RECENT = 1000
+"""Transforms sent here of which the echo on /tf may still be under way; queues hold 100."""
 
 
 class Transforms:
-    """Publishes transforms on /tf and listens there, so that no frame gets a second parent and no loop.
+    """Publishes transforms on /tf and listens there, so that no frame gets a second publisher or parent and no loop.
 
     Args:
         node: to publish with.
@@ -33,11 +35,12 @@ class Transforms:
         kind = importlib.import_module("tf2_msgs.msg").TFMessage  # part of ROS, but not of every installation
         self._message, self._poses, self._say = kind, poses, say
         self._parents: dict[str, str] = {}
-        self._own: set[tuple[str, str]] = set()
-        """(child, parent) as published here; they come back on /tf."""
+        """As others have told: child -> parent."""
+        self._sent: dict[tuple[str, str, int], None] = {}
+        """Parent, child and stamp (ns) of what was sent from here, oldest first; it comes back on /tf."""
         self._publisher = node.create_publisher(kind, "/tf", QOS)
         node.create_subscription(kind, "/tf", self._heard, QOS)
-        node.create_subscription(kind, "/tf_static", self._heard, STATIC_QOS)
+        node.create_subscription(kind, "/tf_static", self._heard_static, STATIC_QOS)
 
     def send(self, T: Float64Array, stamp_ns: int, frame_id: str, child_frame_id: str) -> str:
         """Publish T (4x4, m) as frame_id -> child_frame_id; returns why not, "" when it was."""
@@ -46,15 +49,18 @@ class Transforms:
             self._say(reason)
             return reason
         transform = self._poses.transform_stamped(T, stamp_ns, frame_id, child_frame_id)
-        self._own.add((child_frame_id, frame_id))
+        self._remember((frame_id, child_frame_id, stamp_ns))
         self._publisher.publish(self._message(transforms=[transform]))
         return ""
 
     def _objection(self, frame_id: str, child: str) -> str:
-        """Why the transform would break the tree; "" when it would not."""
-        parent = self._parents.get(child, frame_id)
-        if parent != frame_id:
-            why = f"{child} already has the parent {parent}"
+        """Why the transform would break the tree; "" when it would not.
+
+        A parent of the same name is no better than another one: two answers to where the child is.
+        """
+        parent = self._parents.get(child)
+        if parent is not None:
+            why = f"{child} already has the parent {parent}, as somebody else publishes"
         elif child in self._upwards(frame_id):
             why = f"{frame_id} already hangs below {child}"
         else:
@@ -68,9 +74,22 @@ class Transforms:
             chain.append(parent)
         return chain
 
+    def _remember(self, sent: tuple[str, str, int]) -> None:
+        self._sent[sent] = None
+        if len(self._sent) > RECENT:
+            del self._sent[next(iter(self._sent))]
+
     def _heard(self, message: Any) -> None:
         for transform in message.transforms:
-            child, parent = transform.child_frame_id, transform.header.frame_id
-            room = child in self._parents or len(self._parents) < MOST_FRAMES
-            if room and (child, parent) not in self._own:
-                self._parents[child] = parent
+            stamp_ns = transform.header.stamp.sec * 1_000_000_000 + transform.header.stamp.nanosec
+            if (transform.header.frame_id, transform.child_frame_id, stamp_ns) not in self._sent:
+                self._learn(transform)
+
+    def _heard_static(self, message: Any) -> None:
+        for transform in message.transforms:  # nothing is sent there from here, so none is an echo
+            self._learn(transform)
+
+    def _learn(self, transform: Any) -> None:
+        child = transform.child_frame_id
+        if child in self._parents or len(self._parents) < MOST_FRAMES:
+            self._parents[child] = transform.header.frame_id

@@ -28,7 +28,7 @@ from garps_ros import solver
 from garps_ros.intake import DEPTH, IMAGE
 from garps_ros.log import Log
 from garps_ros.node import PoseNode
-from garps_ros.transforms import Transforms
+from garps_ros.transforms import RECENT, Transforms
 from msg_adapters import MessageError, PoseWriter
 
 
@@ -57,9 +57,9 @@ class Topics:
         self.sent += message.transforms
         self.listeners["/tf"](message)
 
-    def other(self, parent, child, topic="/tf_static"):
+    def other(self, parent, child, topic="/tf_static", stamp_ns=START - 1):
         """Somebody else publishes a transform."""
-        transform = PoseWriter(rclpy_class).transform_stamped(np.eye(4), START, parent, child)
+        transform = PoseWriter(rclpy_class).transform_stamped(np.eye(4), stamp_ns, parent, child)
         self.listeners[topic](TFMessage([transform]))
 
 
@@ -99,10 +99,29 @@ def test_static_transforms_from_before_are_asked_for(topics, transforms):
 
 
 @pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
-def test_the_same_parent_by_somebody_else_is_no_hindrance(topics, transforms, said, topic):
+def test_the_same_parent_by_somebody_else_is_a_second_answer(topics, transforms, said, topic):
     topics.other("left", "right", topic)
+    reason = transforms.send(moved(0.25), START, "left", "right")
+    assert topics.sent == [] and said == [reason]
+    assert "right already has the parent left, as somebody else publishes" in reason and "source_frame" in reason
+
+
+@pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf", START + 1), ("/tf_static", START)])
+def test_the_same_transform_as_ours_from_somebody_else_is_told_from_the_echo(topics, transforms, topic, stamp_ns):
+    """On /tf by its stamp; a latched one may well have the stamp of ours."""
     assert transforms.send(moved(0.25), START, "left", "right") == ""
-    assert len(topics.sent) == 1 and said == []
+    topics.other("left", "right", topic, stamp_ns)
+    assert "already has the parent left" in transforms.send(moved(0.25), START + 2, "left", "right")
+    assert len(topics.sent) == 1
+
+
+def test_an_echo_may_come_late_but_not_for_ever(topics, transforms):
+    for index in range(RECENT):
+        transforms.send(moved(0.25), START + index, "left", "right")
+    topics.other("left", "right", "/tf", START)
+    assert transforms.send(moved(0.25), START + RECENT, "left", "right") == "" and len(transforms._sent) == RECENT
+    topics.other("left", "right", "/tf", START)
+    assert transforms.send(moved(0.25), START + RECENT + 1, "left", "right") != ""
 
 
 @pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
