@@ -12,7 +12,7 @@ from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
 from garps_ros.cameras import Frame
 from garps_ros.tracking import Estimator, KeyframeTracker
-from garps_ros.views import view_from_messages
+from garps_ros.views import frame_mismatch, view_from_messages
 from msg_adapters import MessageError, header_frame_id
 
 FAILURES: dict[type[Exception], str] = {
@@ -82,6 +82,8 @@ class ViewReader:
     def __init__(self, rectified: str, say: Callable[[str], None], allow_resized: bool = False) -> None:
         self.rectified, self.allow_resized, self._say = rectified, allow_resized, say
         self._said: dict[str, str] = {}
+        self.doubts: dict[str, str] = {}
+        """By topic: why the last frame read may hold another camera's calibration or depth."""
 
     def read(self, frame: Frame) -> View:
         """Decode, choose the calibration, undistort. Raises MessageError or InputError."""
@@ -94,9 +96,11 @@ class ViewReader:
             rectified=self.rectified,
             allow_resized=self.allow_resized,
         )
-        if self._said.get(topic) != decision:
-            self._said[topic] = decision
-            self._say(f"{topic}: {decision}")
+        self.doubts[topic] = frame_mismatch(frame.image, frame.info, frame.depth)
+        told = f"{decision}; {self.doubts[topic]}" if self.doubts[topic] else decision
+        if self._said.get(topic) != told:
+            self._said[topic] = told
+            self._say(f"{topic}: {told}")
         return view
 
 
@@ -138,7 +142,7 @@ def estimate_keyframes(
 def follow_frame(frame: Frame, reader: ViewReader, tracker: KeyframeTracker) -> Iterator[Origin | Outcome]:
     """One more frame of the camera: an Origin where a segment begins, else every attempt at a pose."""
     began = time.perf_counter()
-    name = header_frame_id(frame.image) or _topic_name(frame)
+    name = frame_name(frame)
     try:
         view = reader.read(frame)
         if tracker.begins(view):
@@ -163,7 +167,7 @@ def _start_name(name: str, tracker: KeyframeTracker) -> str:
 def failed_outcome(frames: tuple[Frame, ...], error: Exception) -> Outcome:
     """The outcome of one or two frames that ended in an error nobody expected."""
     source, target = frames[0], frames[-1]
-    names = frame_names(source, target)
+    names = frame_names(source, target) if len(frames) == 2 else (frame_name(source), frame_name(source))
     row = _failed((source.stamp_ns, target.stamp_ns), names, 0, error)
     return Outcome(row, names[1], names[0], None, None, None)
 
@@ -172,6 +176,11 @@ def frame_names(source: Frame, target: Frame) -> tuple[str, str]:
     """Frame names of both cameras; those of their topics where the drivers give none, or the same to both."""
     names = header_frame_id(source.image), header_frame_id(target.image)
     return names if all(names) and names[0] != names[1] else (_topic_name(source), _topic_name(target))
+
+
+def frame_name(frame: Frame) -> str:
+    """Frame name of a camera by itself; that of its topic where the driver gives none."""
+    return header_frame_id(frame.image) or _topic_name(frame)
 
 
 def _topic_name(frame: Frame) -> str:

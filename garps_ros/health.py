@@ -142,12 +142,13 @@ class Health:
         return Finding("inputs", level, message, values)
 
     def estimates(
-        self, idle: str, gaps_s: Mapping[str, float], slop_s: float, now_s: float, timeout_s: float
+        self, idle: str, busy_s: float, gaps_s: Mapping[str, float], slop_s: float, now_s: float, timeout_s: float
     ) -> Finding:
         """The verdict on what came of the inputs; to be asked for after theirs.
 
         Args:
             idle: why nothing is computed on purpose; "" when it is.
+            busy_s: for how long the present computation has been running, s; 0 when there is none.
             gaps_s: between newest stamps of streams that belong together, s.
             slop_s: the largest gap that pairs, s.
             now_s: steady time, s.
@@ -157,7 +158,8 @@ class Health:
         unpaired = since_s is not None and now_s - max(since_s, self.last_pair_s or since_s) > timeout_s
         rejected = self._grown("rejected", self.rejected.total())
         used = self._grown("used", self.used)
-        level, message = Level.OK, f"{used} pose(s) in the last second" if used else "waiting for images"
+        waiting = f"computing for {busy_s:.1f} s" if busy_s else "waiting for images"
+        level, message = Level.OK, f"{used} pose(s) in the last second" if used else waiting
         if idle:
             message = idle
         elif unpaired:
@@ -225,7 +227,8 @@ def _troubles(states: list[InputState], now_s: float, timeout_s: float) -> list[
 
 def _loss(state: InputState) -> str:
     return (
-        f"{state.role}: about {state.arrivals.missing():.0%} of the messages on {state.topic} are lost on the way; "
+        f"{state.role}: about {state.arrivals.missing():.0%} of the messages on {state.topic} ({state.qos}) "
+        "seem lost on the way; "
         "large images need the profile config/fastdds_large_images.xml on both sides, or image_transport:=compressed"
     )
 

@@ -2,13 +2,13 @@
 """The live node: topics in, newest pair to the worker, poses and diagnostics out. One thread besides the worker's.
 
 Everything of ROS happens in the executor's thread, also publishing: so a reset that has been answered is never
-followed by a result from before it, and nothing is published while the node is taken down.
+followed by the result of a computation that was under way (images that were still on their way may follow), and nothing
+is published while the node is taken down.
 """
 
 from __future__ import annotations
 
 import time
-from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType, JumpThreshold
@@ -30,7 +30,7 @@ from garps_ros.worker import Worker
 from msg_adapters import MessageError
 
 NANOSECONDS = 1_000_000_000
-OFFERS_PERIOD_S = 0.2
+OFTEN_S = 0.2
 STALE = "stale: reset or settings changed"
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False)
 
@@ -50,7 +50,8 @@ class PoseNode:
         self._health, self._priors = Health(), Priors()
         self._enabled, self._epoch, self._generation = True, 0, 0
         self._parameters = NodeParameters(node, self._settings_changed)
-        self._publishing = Publishing(node, self._parameters.node.publish_tf, partial(self._log.warn, "tf"))
+        self._decisive = self._what_decides()
+        self._publishing = Publishing(node, self._parameters.node.publish_tf, self._log)
         cameras = camera_topics(node, self._parameters.node)
         self._intake = Intake(cameras, self._slop_ns, self._refused, self._forget)
         takers = Takers(self._image, self._info, self._prior, self._log.warn)
@@ -62,7 +63,7 @@ class PoseNode:
         node.create_service(Trigger, "~/reset", self._reset)
         node.create_service(SetBool, "~/enable", self._enable)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # the node's own clock may stand still, or jump
-        node.create_timer(OFFERS_PERIOD_S, self._follow_offers, clock=steady)
+        node.create_timer(OFTEN_S, self._often, clock=steady)
         node.create_timer(1.0, self._every_second, clock=steady)
         # The handle is kept: without it rclpy calls into freed memory when the clock jumps.
         self._jump_handle = node.get_clock().create_jump_callback(BACKWARDS, post_callback=self._clock_jumped)
@@ -135,36 +136,42 @@ class PoseNode:
                 self._health.dropped[STALE] += 1
                 continue
             self._report(result)
-            for outcome in result.outcomes:
-                self._publish(outcome, result)
+            self._publish(result)
 
     def _report(self, result: Result) -> None:
         """What a result says besides its poses."""
         facts = self._health.facts
+        facts["prior"] = result.prior
+        facts["doubts"] = "; ".join(result.doubts)
         if result.keyframes:
             facts["keyframes"] = str(result.keyframes)
-        facts["prior"] = result.prior_refused or ("none" if result.job.prior is None else "used")
-        if result.prior_refused:
-            self._refused("prior", result.prior_refused)
+        if result.prior not in ("none", "used"):
+            self._log.warn("prior", f"prior {result.prior}")
+        for doubt in result.doubts:
+            self._log.warn(f"doubt {doubt}", doubt)
         if result.trace:
             self._log.error("estimate", f"unexpected error: {result.trace}")
 
-    def _publish(self, outcome: Origin | Outcome, result: Result) -> None:
-        if isinstance(outcome, Origin):
-            self._log.info(f"{outcome.frame_id} begins at the image of {outcome.stamp_ns} ns")
+    def _publish(self, result: Result) -> None:
+        """The pose of a result, if any attempt has one; else why the last has none."""
+        for origin in (o for o in result.outcomes if isinstance(o, Origin)):
+            self._log.info(f"{origin.frame_id} begins at the image of {origin.stamp_ns} ns")
+            self._health.facts["frames"] = f"{origin.child_frame_id} in {origin.frame_id}"
+        attempts = [outcome for outcome in result.outcomes if isinstance(outcome, Outcome)]
+        if not attempts:
             return
-        row = outcome.row
-        if row.overlap is not None:
-            self._health.facts["overlap"] = f"{row.overlap:.2f}"
+        outcome = next((attempt for attempt in attempts if attempt.T is not None), attempts[-1])
+        self._health.facts["frames"] = f"{outcome.child_frame_id} in {outcome.frame_id}"
+        if outcome.row.overlap is not None:
+            self._health.facts["overlap"] = f"{outcome.row.overlap:.2f}"
         if outcome.T is None or outcome.covariance is None:
-            self._reject(row.status, row.reason)
+            self._reject(outcome.row.status, outcome.row.reason)
             return
         try:
-            note = self._publishing.publish(outcome, outcome.T, outcome.covariance)
+            self._health.facts["transform"] = self._publishing.publish(outcome, outcome.T, outcome.covariance)
         except MessageError as error:
             self._reject("not_publishable", str(error))
             return
-        self._health.facts["transform"] = note
         arrived_s = result.job.arrived_s
         self._health.publish(time.monotonic() - arrived_s, result.began_s - arrived_s, result.core_s)
         if result.clouds is not None:
@@ -181,8 +188,19 @@ class PoseNode:
         return round(self._parameters.node.sync_slop * NANOSECONDS)
 
     def _settings_changed(self) -> None:
-        self._generation += 1
+        """Results of other settings are dropped, where those had a say; a keyframe read otherwise is forgotten."""
+        before, self._decisive = self._decisive, self._what_decides()
+        if before[:2] != self._decisive[:2]:
+            self._epoch += 1
+        if before != self._decisive:
+            self._generation += 1
+            self._withdraw()
         self._apply_settings()
+
+    def _what_decides(self) -> tuple[Any, ...]:
+        """The settings that a result depends on; the first two are about reading images."""
+        s = self._parameters.node
+        return s.rectified, s.allow_resized, s.source_frame, s.target_frame, self._parameters.config
 
     def _apply_settings(self) -> None:
         self._intake.slop_ns = self._slop_ns
@@ -208,8 +226,9 @@ class PoseNode:
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._intake.forget()
+        self._priors.forget(standing=True)
         self._forget("reset")
-        response.success, response.message = True, "began anew: keyframe and waiting images are forgotten"
+        response.success, response.message = True, "began anew: keyframe, prior and waiting images are forgotten"
         return response
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -222,9 +241,11 @@ class PoseNode:
 
     # --- how it is doing --------------------------------------------------------------------------------------------
 
-    def _follow_offers(self) -> None:
+    def _often(self) -> None:
         for input_ in self._inputs:
             input_.follow_offers()
+        for frames in self._intake.settle():
+            self._offer(frames)
 
     def _every_second(self) -> None:
         self._revive()
@@ -233,7 +254,9 @@ class PoseNode:
             self._health.inputs(
                 [i.state() for i in self._inputs], now_s, settings.input_timeout, self._clock_trouble()
             ),
-            self._health.estimates(idle, self._intake.gaps_s(), settings.sync_slop, now_s, settings.input_timeout),
+            self._health.estimates(
+                idle, self._worker.busy_s, self._intake.gaps_s(), settings.sync_slop, now_s, settings.input_timeout
+            ),
             self._health.machine(self._solver.stage, self._worker.busy_s, settings.stage_timeout, self._machine()),
         ]
         self._publishing.report(findings)
@@ -247,6 +270,8 @@ class PoseNode:
         self._health.fail("worker", f"ended by {self._worker.death}; restarted")
         self._log.error("worker", f"worker ended by {self._worker.death}: restarted")
         self._epoch += 1
+        self._generation += 1
+        self._withdraw()
         self._worker.restart()
 
     def _clock_trouble(self) -> str:

@@ -6,7 +6,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-MAX_WAITING = 60
+MAX_WAITING, MAX_WAITING_LIVE = 60, 15
+"""Items that wait for a partner. A camera's image and depth are several MB: live, half a second of them is enough."""
+INTERVALS = 20
+ENOUGH_INTERVALS = 3
 
 
 class Pairer:
@@ -18,10 +21,16 @@ class Pairer:
 
     Args:
         slop_ns: largest difference of a pair, nanoseconds; 0 = equal stamps only.
+        live: do not hold an item back where its stream's rhythm says that the next one will be farther; for regular
+            streams the pairs are the same, one period sooner.
     """
 
-    def __init__(self, slop_ns: int) -> None:
+    def __init__(self, slop_ns: int, live: bool = False) -> None:
         self.slop_ns = slop_ns
+        self._most_waiting = MAX_WAITING_LIVE if live else MAX_WAITING
+        self._intervals: tuple[deque[int], deque[int]] | None = (
+            (deque(maxlen=INTERVALS), deque(maxlen=INTERVALS)) if live else None
+        )
         self.unpaired = [0, 0]
         """Items of each stream that found no partner."""
         self._waiting: tuple[deque[tuple[int, Any]], deque[tuple[int, Any]]] = (deque(), deque())
@@ -32,12 +41,18 @@ class Pairer:
         """Add an item to stream 0 or 1; returns the pairs that are now certain, or None if its stamp does not grow."""
         if stamp_ns <= self.latest[stream]:
             return None
+        if self._intervals is not None and self.latest[stream] >= 0:
+            self._intervals[stream].append(stamp_ns - self.latest[stream])
         self.latest[stream] = stamp_ns
         self._waiting[stream].append((stamp_ns, item))
         pairs = self._matched(finished=False)
-        if len(self._waiting[stream]) > MAX_WAITING:  # the other stream has stopped
+        if len(self._waiting[stream]) > self._most_waiting:  # the other stream has stopped
             self._drop(stream)
         return pairs
+
+    def settle(self) -> list[tuple[Any, Any]]:
+        """The pairs that waited for a better partner which is overdue; what has no partner goes on waiting."""
+        return self._matched(finished=True)
 
     def finish(self) -> list[tuple[Any, Any]]:
         """The pairs that waited for a better partner which can no longer come."""
@@ -55,11 +70,16 @@ class Pairer:
             gap = newest - queue[0][0]
             if gap > self.slop_ns or (len(queue) > 1 and abs(queue[1][0] - newest) < gap):
                 self._drop(older)
-            elif gap == 0 or len(queue) > 1 or finished:
+            elif gap == 0 or len(queue) > 1 or finished or self._next_is_farther(older, gap):
                 pairs.append((self._waiting[0].popleft()[1], self._waiting[1].popleft()[1]))
             else:
                 break
         return pairs
+
+    def _next_is_farther(self, stream: int, gap: int) -> bool:
+        """Whether the next item of the stream, one period on, will be farther than `gap` on the other side."""
+        intervals = self._intervals[stream] if self._intervals else ()
+        return len(intervals) >= ENOUGH_INTERVALS and 10 * min(intervals) > 22 * gap
 
     def _drop(self, stream: int) -> None:
         self._waiting[stream].popleft()

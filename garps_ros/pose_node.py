@@ -11,6 +11,7 @@ import signal
 import sys
 import traceback
 from types import FrameType
+from typing import Any
 
 NAME = "pose_node"
 SPIN_S = 0.2
@@ -55,45 +56,61 @@ def main(arguments: list[str] | None = None) -> int:
         import rclpy
     except ImportError as error:
         return _refuse(f"rclpy is not there ({error}): source /opt/ros/jazzy/setup.bash, or see requirements-ros.txt")
-    from garps_core.errors import ConfigError
-
     try:
-        rclpy.init(args=words, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
-        unknown = rclpy.utilities.remove_ros_args(words)[1:]
-        if unknown:
-            return _refuse(f"unknown argument {unknown[0]!r}: expected --help or --ros-args ...")
-        return _run(stopped)
-    except ConfigError as error:
-        return _refuse(str(error))
-    except (RuntimeError, ValueError) as error:  # ROS arguments that cannot be parsed
+        started = _start(words)
+    except Exception as error:
         if stopped:
             return 0
+        if not _is_users(error):
+            raise
         return _refuse(str(error))
+    try:
+        return _run(*started, stopped)
     finally:
         rclpy.try_shutdown()
 
 
-def _run(stopped: list[int]) -> int:
+def _start(words: list[str]) -> tuple[Any, Any, Any]:
+    """Executor, rclpy node and what runs in it."""
+    import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
 
+    from garps_core.errors import ConfigError
     from garps_ros.node import PoseNode
 
+    rclpy.init(args=words, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    unknown = rclpy.utilities.remove_ros_args(words)[1:]
+    if unknown:
+        raise ConfigError(f"unknown argument {unknown[0]!r}: expected --help or --ros-args ...")
     executor, ros = SingleThreadedExecutor(), Node(NAME)
     node = PoseNode(ros)
     executor.add_node(ros)
+    return executor, ros, node
+
+
+def _is_users(error: Exception) -> bool:
+    """Whether an error at the start is about what the user has given: arguments, parameters, names."""
+    from rclpy import exceptions
+
+    from garps_core.errors import ConfigError
+
+    theirs = (ConfigError, exceptions.ParameterException, exceptions.NameValidationException)
+    return isinstance(error, theirs) or type(error).__name__ in ("RCLError", "UnknownROSArgsError")
+
+
+def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
     while not stopped:
         try:
             executor.spin_once(timeout_sec=SPIN_S)
         except Exception as error:
             node.failed(error, traceback.format_exc())
-    ended = node.stop(PATIENCE_S)
-    executor.shutdown()
-    ros.destroy_node()
-    if not ended:  # the computation goes on in native code; the interpreter cannot be taken down under it
+    if not node.stop(PATIENCE_S):  # it goes on in native code; the interpreter cannot be taken down under it
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
+    executor.shutdown()
+    ros.destroy_node()
     return 0
 
 

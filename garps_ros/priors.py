@@ -24,16 +24,19 @@ class Priors:
         self._standing: Any = None
 
     def add(self, message: Any) -> None:
-        """Keep a message. Raises MessageError on a malformed stamp."""
+        """Keep a message. Raises MessageError on one that no frame name would make right."""
         stamp_ns = stamp_to_ns(message.header.stamp)
+        prior_from_message(message, header_frame_id(message))
         if stamp_ns == 0:
             self._standing = message
         else:
             self._timed.append((stamp_ns, message))
 
-    def forget(self) -> None:
-        """Drop what belongs to a time."""
+    def forget(self, standing: bool = False) -> None:
+        """Drop what belongs to a time; with `standing` also what stands for all times."""
         self._timed.clear()
+        if standing:
+            self._standing = None
 
     def near(self, stamp_ns: int, max_age_ns: int) -> Any:
         """The message nearest in time, at most `max_age_ns` away (the latest of equals), else the standing one."""

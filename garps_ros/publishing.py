@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -19,9 +20,10 @@ from garps_core.checks import Float64Array
 from garps_ros.estimates import Outcome
 from garps_ros.health import Finding
 from garps_ros.inputs import SIDES
+from garps_ros.log import Log
 from garps_ros.solver import Cloud
 from garps_ros.transforms import Transforms
-from msg_adapters import CloudWriter, PoseWriter
+from msg_adapters import CloudWriter, MessageError, PoseWriter
 
 QOS = QoSProfile(depth=10)  # reliable, keep last, volatile: what navigation subscribes to
 CLOUD_QOS = QoSProfile(depth=1)
@@ -40,11 +42,11 @@ class Publishing:
     Args:
         node: to publish with.
         transforms: also publish on /tf.
-        say: called with a line when a transform cannot be published.
+        log: takes what cannot be published.
     """
 
-    def __init__(self, node: Node, transforms: bool, say: Callable[[str], None]) -> None:
-        self._node = node
+    def __init__(self, node: Node, transforms: bool, log: Log) -> None:
+        self._node, self._log = node, log
         self._pose = node.create_publisher(PoseStamped, "~/pose", QOS)
         self._odometry = node.create_publisher(Odometry, "~/odometry", QOS)
         self._clouds = [node.create_publisher(PointCloud2, f"~/{name}_cloud", CLOUD_QOS) for name in SIDES]
@@ -53,9 +55,9 @@ class Publishing:
         self._transforms: Transforms | None = None
         if transforms:
             try:
-                self._transforms = Transforms(node, self._poses, say)
+                self._transforms = Transforms(node, self._poses, partial(log.warn, "tf"))
             except ImportError as error:
-                say(f"publish_tf has no effect: {error}; install tf2_msgs (apt: ros-jazzy-tf2-msgs)")
+                log.warn("tf", f"publish_tf has no effect: {error}; install tf2_msgs (apt: ros-jazzy-tf2-msgs)")
 
     @property
     def wanted(self) -> bool:
@@ -86,10 +88,16 @@ class Publishing:
 
     def show(self, clouds: tuple[Cloud, Cloud], outcome: Outcome) -> None:
         """Publish the source and target clouds to those that are subscribed to."""
+        stamp_ns = outcome.row.source_stamp_ns
         for publisher, cloud in zip(self._clouds, clouds, strict=True):
-            if publisher.get_subscription_count():
-                stamp_ns = outcome.row.source_stamp_ns
-                publisher.publish(self._points.point_cloud(cloud.points, cloud.colours, stamp_ns, outcome.frame_id))
+            if not publisher.get_subscription_count():
+                continue
+            try:
+                message = self._points.point_cloud(cloud.points, cloud.colours, stamp_ns, outcome.frame_id)
+            except MessageError as error:
+                self._log.warn("clouds", f"no cloud: {error}; raise lifting.stride")
+                continue
+            publisher.publish(message)
 
     def report(self, findings: Iterable[Finding]) -> None:
         """Publish findings on /diagnostics, each named after the node."""

@@ -52,6 +52,9 @@ class NodeSettings(Checked, prefix=""):
     keyframe_overlap: float = setting(0.5, "new keyframe when the overlap falls below", low=0, high=1)
     keyframe_motion: float = setting(0.3, "new keyframe beyond this distance", unit="m", low=0, high=1000)
     keyframe_rotation: float = setting(20.0, "new keyframe beyond this rotation", unit="deg", low=0, high=180)
+    keyframe_lost_after: int = setting(
+        5, "a new trajectory begins after so many frames in a row without a pose", unit="frames", low=1, high=1000
+    )
     source_frame: str = setting("", "name to publish instead of the frame_id of the source images")
     target_frame: str = setting("", "name to publish instead of the frame_id of the target images")
     lazy: bool = setting(True, "compute only while somebody subscribes to a result; keyframe pairing always computes")

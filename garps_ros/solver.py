@@ -25,7 +25,7 @@ from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_pair, fail
 from garps_ros.priors import prior_from_message
 from garps_ros.settings import NodeSettings
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
-from msg_adapters import MessageError
+from msg_adapters import MessageError, header_frame_id
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Job:
         settings, config: as they were when the frames became complete.
         epoch: counts resets and jumps back in time; a keyframe of another epoch is forgotten.
         generation: counts everything that makes earlier results stale; a result of another generation is dropped.
-        arrived_s: steady time at which the newest of the messages came.
+        arrived_s: steady time at which the frames became complete.
         prior: PoseWithCovarianceStamped for this pair, or None.
         clouds: also make the point clouds.
     """
@@ -70,14 +70,16 @@ class Result:
     """Steady time at which the computation began."""
     core_s: float = 0.0
     """Time inside `estimate_relative_pose`, all attempts together, s."""
-    prior_refused: str = ""
-    """Why the prior was not used; empty when it was, or when there was none."""
-    used_prior: bool = False
+    prior: str = "none"
+    """What became of the prior: none, used, or why not."""
+    doubts: list[str] = field(default_factory=list)
+    """What looks wrong about frame names; poses are computed all the same."""
     clouds: tuple[Cloud, Cloud] | None = None
     """Source and target, both in the target frame, when asked for and when there is a pose."""
     trace: str = ""
     """Of an error that nobody expected."""
     keyframes: int = 0
+    """Keyframes so far, of the camera that is followed."""
 
 
 class Solver:
@@ -108,6 +110,7 @@ class Solver:
             try:
                 for outcome in self._outcomes():
                     result.outcomes.append(self._renamed(outcome))
+                result.doubts = self._doubts()
                 if job.clouds and result.outcomes:
                     result.clouds = self._clouds(result.outcomes[-1])
             except Exception as error:
@@ -127,10 +130,15 @@ class Solver:
     def _followed(self) -> KeyframeTracker:
         settings = self._job.settings
         rule = KeyframeRule(
-            settings.keyframe_overlap, settings.keyframe_motion, math.radians(settings.keyframe_rotation)
+            settings.keyframe_overlap,
+            settings.keyframe_motion,
+            math.radians(settings.keyframe_rotation),
+            settings.keyframe_lost_after,
         )
         if self._tracker is None or self._epoch != self._job.epoch:
-            self._tracker, self._epoch = KeyframeTracker(self._estimate, rule), self._job.epoch
+            # Segments are counted on: poses of before and after a reset must not share a frame.
+            segment = 0 if self._tracker is None else self._tracker.segment
+            self._tracker, self._epoch = KeyframeTracker(self._estimate, rule, segment), self._job.epoch
         self._tracker.rule = rule
         return self._tracker
 
@@ -140,15 +148,27 @@ class Solver:
         try:
             target_frame = self._job.settings.target_frame or frame_names(self._job.frames[0], self._job.frames[1])[1]
             self._prior = prior_from_message(self._job.prior, target_frame)
-            self._result.used_prior = True
         except MessageError as error:
-            self._result.prior_refused = str(error)
+            self._result.prior = f"refused: {error}"
+
+    def _doubts(self) -> list[str]:
+        frames, settings = self._job.frames, self._job.settings
+        doubts = [f"{f.topics.image}: {d}" for f in frames if (d := self._reader.doubts.get(f.topics.image))]
+        told = [header_frame_id(frame.image) for frame in frames]
+        named = settings.source_frame and (settings.target_frame or len(frames) == 1)
+        if not named and (not all(told) or len(set(told)) < len(told)):
+            what = f"images say frame_id {', '.join(map(repr, told))}: topics name the frames instead"
+            doubts.append(f"{what}; set source_frame and target_frame")
+        return doubts
 
     def _estimate(self, source: View, target: View) -> PoseEstimate:
         began = time.perf_counter()
         with self._in_stage("estimate"):
             found = estimate_relative_pose(source, target, self._job.config, self._prior)
         self._result.core_s += time.perf_counter() - began
+        if self._prior is not None:
+            given = found.initial is not None and found.initial.origin == "given"
+            self._result.prior = "used" if given else f"not used: start.method is {self._job.config.start.method}"
         self._seen = source, target, found
         return found
 

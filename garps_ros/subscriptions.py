@@ -9,7 +9,7 @@ from typing import Any
 
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
 from garps_ros.arrivals import Arrivals
 from garps_ros.health import InputState
@@ -58,7 +58,8 @@ class Input:
 
     def follow_offers(self) -> None:
         """Look at the publishers; subscribe anew where another QoS suits them better. Cheap: call it often."""
-        offers = self._node.get_publishers_info_by_topic(self.topic)
+        # By the name before remapping: rclpy remaps it here too, and would remap a remapped one once more.
+        offers = self._node.get_publishers_info_by_topic(self._topic)
         self._publishers = len(offers)
         self._problem = self._type_problem(offers) or self._qos_problem(offers)
         if not offers:
@@ -91,9 +92,12 @@ class Input:
         self._received(message)
 
     def _incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        if self._reliability == "auto":
+            return  # `follow_offers` is about to ask for less
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
         self._say(
-            f"{self._role}: a publisher on {self.topic} offers a QoS that does not match {self._qos.reliability.name} "
-            f"({event.total_count} so far): nothing will arrive from it; set image_qos to auto or best_effort"
+            f"{self._role}: a publisher on {self.topic} offers less {policy} than image_qos:={self._reliability} asks "
+            f"for ({event.total_count} so far): nothing will arrive from it; set image_qos to auto or best_effort"
         )
 
     def _qos_problem(self, offers: list[Any]) -> str:

@@ -61,14 +61,15 @@ class KeyframeTracker:
     Args:
         estimate: (source, target) -> PoseEstimate of the source camera in the target camera's frame.
         rule: when to take a new keyframe.
+        segment: the last one of an earlier tracker, to count on from.
     """
 
-    def __init__(self, estimate: Estimator, rule: KeyframeRule) -> None:
+    def __init__(self, estimate: Estimator, rule: KeyframeRule, segment: int = 0) -> None:
         self._estimate, self.rule = estimate, rule
         self._keyframe: _Located | None = None
         self._last: _Located | None = None
         self._failures = 0
-        self.segment = 0
+        self.segment = segment
         """Counts from 1; poses of different segments are not related to each other."""
         self.keyframes = 0
 

@@ -40,7 +40,21 @@ def view_from_messages(
     )
     metres = None if depth is None else depth_image(depth)
     rgb, metres = camera.rectify(rgb, metres)
-    frame_id, decision = header_frame_id(image), camera.decision
-    if depth is not None and header_frame_id(depth) != frame_id:
-        decision += f"; depth is of frame {header_frame_id(depth)!r}, not {frame_id!r}: is it registered to the image?"
-    return View(rgb=rgb, K=camera.K, depth=metres, stamp_ns=header_stamp_ns(image), frame_id=frame_id), decision
+    view = View(rgb=rgb, K=camera.K, depth=metres, stamp_ns=header_stamp_ns(image), frame_id=header_frame_id(image))
+    return view, camera.decision
+
+
+def frame_mismatch(image: Any, info: Any, depth: Any = None) -> str:
+    """Why calibration or depth may be another camera's, from the frames they name; "" when they name the image's.
+
+    No error: some drivers are sloppy with frames. But wrong remapping looks just like it, and gives wrong poses.
+    """
+    frame_id = header_frame_id(image)
+    doubts = []
+    for name, message, question in (
+        ("camera_info", info, "is it this camera's?"),
+        ("depth", depth, "is it registered to the image?"),
+    ):
+        if message is not None and header_frame_id(message) != frame_id:
+            doubts.append(f"{name} is of frame {header_frame_id(message)!r}, the image of {frame_id!r}: {question}")
+    return "; ".join(doubts)

@@ -87,9 +87,13 @@ class Worker(Generic[Job, Result]):
                 self._busy_since = begun_s = time.monotonic()
                 self._results.append(self._compute(job))
                 self._busy_since = None
-                self._finished()
-        except BaseException as error:  # also SystemExit and MemoryError: whoever watches must know
+                self._tell()
+        except BaseException as error:  # also SystemExit: whoever watches must know
             self.death = f"{type(error).__name__}: {error}"
+            self._tell()
+
+    def _tell(self) -> None:
+        if not self._stopped:  # whoever has stopped it may already be gone
             self._finished()
 
     def _next(self, begun_s: float) -> Job | None:

@@ -34,8 +34,8 @@ def inputs(*states, health=None, waiting="", now_s=NOW):
     return (health or Health()).inputs(states, now_s, TIMEOUT, waiting)
 
 
-def estimates(health, idle="", gaps_s=None, now_s=NOW):
-    return health.estimates(idle, gaps_s or {}, SLOP, now_s, TIMEOUT)
+def estimates(health, idle="", gaps_s=None, now_s=NOW, busy_s=0.0):
+    return health.estimates(idle, busy_s, gaps_s or {}, SLOP, now_s, TIMEOUT)
 
 
 def machine(health, stage="", busy_s=0.0, **values):
@@ -287,3 +287,9 @@ def test_a_verdict_takes_no_time():
         inputs(*states, health=health)
         estimates(health)
     assert time.perf_counter() - began < 2
+
+
+def test_a_long_computation_is_not_waiting_for_images():
+    health = Health()
+    assert estimates(health).message == "waiting for images"
+    assert estimates(health, busy_s=2.5).message == "computing for 2.5 s"

@@ -14,7 +14,7 @@ from garps_ros.bags import Bag
 from garps_ros.cameras import CameraTopics
 from garps_ros.frames import Frames
 from garps_ros.intake import DEPTH, IMAGE, JUMP_BACK_NS, STUBBORN, Intake
-from garps_ros.pairing import Pairer
+from garps_ros.pairing import MAX_WAITING_LIVE, Pairer
 
 MS = 1_000_000
 SLOP = 20 * MS
@@ -68,8 +68,39 @@ def test_a_frame_is_what_belongs_together_and_knows_its_camera():
 def test_one_camera_gives_its_frames_alone():
     live = Live(cameras=1)
     assert live.frame(0) == [(0,)] and live.frame(PERIOD) == [(PERIOD,)]
-    assert live.frame(2 * PERIOD, depth_after_ns=5 * MS) == [], "a nearer depth may still come"
-    assert live.frame(3 * PERIOD, depth_after_ns=5 * MS) == [(2 * PERIOD,)]
+    assert live.frame(2 * PERIOD, depth_after_ns=5 * MS) == [], "a nearer image may still come: no rhythm is known"
+    assert live.frame(3 * PERIOD, depth_after_ns=5 * MS) == [(2 * PERIOD,), (3 * PERIOD,)]
+    assert live.frame(4 * PERIOD, depth_after_ns=5 * MS) == [(4 * PERIOD,)], "the next image comes a period later"
+
+
+def test_what_waits_for_a_better_partner_is_not_held_for_ever():
+    live = Live()
+    assert live.pair(0, 3 * MS) == []
+    assert live.intake.settle() == [], "something has just come"
+    ((source, target),) = live.intake.settle()
+    assert (source.stamp_ns, target.stamp_ns) == (START, START + 3 * MS)
+    assert live.frame(PERIOD, depth_after_ns=5 * MS) == [] and live.intake.settle() == []
+    assert live.intake.settle() == [], "the frame is complete, its partner is not there"
+    assert live.frame(PERIOD + 5 * MS, TARGET) == [] and live.intake.settle() == []
+    assert len(live.intake.settle()) == 1 and live.intake.unpaired == 0
+
+
+def test_live_pairs_of_regular_cameras_come_a_period_sooner_and_are_the_same():
+    live, offline = Live(), Pairer(SLOP)
+    came, expected = [], []
+    for number in range(20):
+        stamps = number * PERIOD, number * PERIOD + 8 * MS
+        came.append(live.pair(stamps[0], 8 * MS))
+        expected += [pair for stream in (0, 1) for pair in offline.add(stream, stamps[stream] + 1, stamps[stream])]
+    assert all(len(pairs) == 1 for pairs in came[5:])
+    assert [pair for pairs in came for pair in pairs][: len(expected)] == expected
+
+
+def test_little_is_kept_of_a_stream_without_partner():
+    live = Live()
+    for number in range(100):
+        live.add(number * PERIOD, SOURCE, IMAGE)
+    assert live.intake.unpaired == 100 - MAX_WAITING_LIVE
 
 
 def test_the_newest_calibration_counts():
@@ -92,7 +123,11 @@ def test_frames_pair_by_the_rule_of_the_pairer(depths, partners, partner_depths,
     stamps[TARGET, IMAGE] = [50 * i + o // 2 for i, o in enumerate(partners)]
     stamps[TARGET, DEPTH] = [50 * i + o // 2 for i, o in enumerate(partner_depths)]
     arrivals = sorted((t, *stream) for stream, times in stamps.items() for t in times)
-    live, cameras, between = Live(slop_ns=slop_ms * MS), [Pairer(slop_ms), Pairer(slop_ms)], Pairer(slop_ms)
+    live, cameras, between = (
+        Live(slop_ns=slop_ms * MS),
+        [Pairer(slop_ms, True), Pairer(slop_ms, True)],
+        Pairer(slop_ms, True),
+    )
     for t, index, role in arrivals:
         expected = []
         for frame, _ in cameras[index].add(role, t + 100, t):
@@ -248,13 +283,12 @@ def test_the_slop_can_be_changed_while_running():
     assert live.pair(0, 5 * MS) == [] and live.pair(PERIOD, 5 * MS) == []
     live.intake.slop_ns = SLOP
     live.pair(2 * PERIOD, 5 * MS)
-    assert live.pair(3 * PERIOD, 5 * MS) == [(2 * PERIOD, 2 * PERIOD + 5 * MS)]
+    assert live.pair(3 * PERIOD, 5 * MS)[0] == (2 * PERIOD, 2 * PERIOD + 5 * MS)
     live.intake.slop_ns = 4 * MS
     assert live.pair(4 * PERIOD, 5 * MS) == [] and live.pair(5 * PERIOD, 5 * MS) == []
     live.intake.slop_ns = SLOP
     live.frame(6 * PERIOD, depth_after_ns=10 * MS)  # of image and depth it counts as well
-    assert live.frame(6 * PERIOD, TARGET) == []
-    assert live.frame(7 * PERIOD, depth_after_ns=0) == [(6 * PERIOD, 6 * PERIOD)]
+    assert live.frame(6 * PERIOD, TARGET) == [(6 * PERIOD, 6 * PERIOD)]
 
 
 def test_the_slop_outlives_forgetting():

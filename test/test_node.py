@@ -312,7 +312,8 @@ def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
     with running(domain, tmp_path, ["image_qos=reliable"]) as (node, peer):
         Rig(peer, reliable=False)
         assert finding(peer, "inputs", "peer offers BEST_EFFORT, image_qos asks for RELIABLE") == 2
-        peer.wait(lambda: "does not match RELIABLE" in node.log(), what="the event's line in the log")
+        text = "offers less RELIABILITY than image_qos:=reliable asks"
+        peer.wait(lambda: text in node.log(), what="the event's line in the log")
     with running(domain, tmp_path) as (_, peer):
         peer.publisher(PointCloud2, "source/image")
         peer.publisher(PointCloud2, "source/depth")

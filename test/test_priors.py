@@ -80,6 +80,8 @@ def test_forgetting_drops_what_belongs_to_a_time_only():
     timed = kept(START)
     timed.forget()
     assert found(timed, START) is None
+    priors.forget(standing=True)
+    assert found(priors, START) is None
 
 
 def test_the_newest_are_kept_and_not_more():

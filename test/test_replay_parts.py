@@ -19,7 +19,7 @@ from garps_ros.cameras import CameraTopics
 from garps_ros.pairing import MAX_WAITING, Pairer
 from garps_ros.topics import choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker, composed_covariance
-from garps_ros.views import view_from_messages
+from garps_ros.views import frame_mismatch, view_from_messages
 from msg_adapters import MessageError
 
 
@@ -280,10 +280,12 @@ def test_a_view_is_undistorted_together_with_its_depth():
     assert np.isnan(made.depth[0, 0]) and made.depth[24, 32] == 1 and (made.rgb[0, 0] == 0).all()
 
 
-def test_a_view_without_depth_has_none_and_foreign_depth_is_mentioned():
-    assert view_from_messages(image(picture(3), "rgb8"), camera_info())[0].depth is None
-    depth = image(np.full((48, 64), 900, np.uint16), "16UC1", frame_id="ir")
-    assert "depth is of frame 'ir', not 'cam'" in view_from_messages(image(picture(3), "rgb8"), camera_info(), depth)[1]
+def test_a_view_without_depth_has_none_and_foreign_depth_or_calibration_is_doubted():
+    rgb, depth = image(picture(3), "rgb8"), image(np.full((48, 64), 900, np.uint16), "16UC1", frame_id="ir")
+    assert view_from_messages(rgb, camera_info())[0].depth is None
+    assert frame_mismatch(rgb, camera_info()) == ""
+    assert "depth is of frame 'ir', the image of 'cam'" in frame_mismatch(rgb, camera_info(), depth)
+    assert "camera_info is of frame 'other'" in frame_mismatch(rgb, camera_info(frame_id="other"))
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def calls(monkeypatch):
 
     def estimate(source, target, config, prior):
         calls.append((source, target, config, prior))
-        return recordings.estimate(source, target)
+        return replace(recordings.estimate(source, target), initial=prior)
 
     monkeypatch.setattr(solver, "estimate_relative_pose", estimate)
     return calls
@@ -185,15 +185,15 @@ def test_a_prior_is_used_for_its_own_pair_only(calls, library):
     result = solve(*pair(), by=by, prior=given("target_optical", library))
     np.testing.assert_array_equal(calls[0][3].T_target_source, moved(0.3))
     np.testing.assert_allclose(calls[0][3].covariance, COVARIANCE)
-    assert result.used_prior and result.prior_refused == ""
+    assert result.prior == "used"
     without = solve(*pair(2), by=by)
-    assert calls[1][3] is None and not without.used_prior and without.prior_refused == ""
+    assert calls[1][3] is None and without.prior == "none"
 
 
 def test_a_prior_speaks_of_the_name_that_is_published(calls):
     settings = replace(SETTINGS, target_frame="map")
-    assert solve(*pair(), settings=settings, prior=given("map")).used_prior
-    assert "'map'" in solve(*pair(), settings=settings, prior=given("target_optical")).prior_refused
+    assert solve(*pair(), settings=settings, prior=given("map")).prior == "used"
+    assert "'map'" in solve(*pair(), settings=settings, prior=given("target_optical")).prior
 
 
 @pytest.mark.parametrize(
@@ -206,8 +206,8 @@ def test_a_prior_speaks_of_the_name_that_is_published(calls):
 )
 def test_a_prior_that_cannot_be_used_is_left_out_with_its_reason(calls, prior, reason):
     result = solve(*pair(), prior=prior())
-    assert re.search(reason, result.prior_refused)
-    assert not result.used_prior and calls[0][3] is None and result.outcomes[0].T is not None
+    assert re.search(reason, result.prior) and result.prior.startswith("refused: ")
+    assert calls[0][3] is None and result.outcomes[0].T is not None
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -270,7 +270,8 @@ def test_another_epoch_forgets_the_keyframe(calls):
     by = Solver(print)
     assert targets(follow(by, (1, 2, 3))) == [1, 1]
     (begins, *rest) = follow(by, (4, 5), epoch=1)
-    assert isinstance(begins, Origin) and (begins.segment, begins.stamp_ns) == (1, frame(4).stamp_ns)
+    assert isinstance(begins, Origin) and (begins.segment, begins.stamp_ns) == (2, frame(4).stamp_ns)
+    assert begins.frame_id == "source_optical_start_2", "poses of before and after must not share a frame"
     assert targets(rest) == [4]
     assert solve(frame(6), settings=KEYFRAME, by=by, epoch=1).keyframes == 1
 
@@ -383,3 +384,21 @@ def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     follow(by, (1, 2))
     result = solve(frame(3), settings=KEYFRAME, by=by, clouds=True)
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
+
+
+def test_a_prior_that_the_start_method_ignores_is_not_called_used(monkeypatch):
+    answering(monkeypatch, recordings.estimate)
+    assert solve(*pair(), prior=given("target_optical")).prior == "not used: start.method is auto"
+
+
+def test_frame_names_that_cannot_be_right_are_doubted(calls):
+    assert solve(*pair()).doubts == []
+    (doubt,) = solve(frame(1), frame(1, "target", frame_id="")).doubts
+    assert "frame_id 'source_optical', ''" in doubt and "set source_frame and target_frame" in doubt
+    (doubt,) = solve(frame(1), frame(1, "target", frame_id="source_optical")).doubts
+    assert "topics name the frames" in doubt
+    named = replace(SETTINGS, source_frame="a", target_frame="b")
+    assert solve(frame(1), frame(1, "target", frame_id=""), settings=named).doubts == []
+    foreign = replace(frame(1, "target"), info=camera_info(D=[0] * 5, model="plumb_bob", frame_id="other"))
+    (doubt,) = solve(frame(1), foreign).doubts
+    assert doubt.startswith("/target/image: camera_info is of frame 'other'")
