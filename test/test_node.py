@@ -255,7 +255,7 @@ def test_disabled_means_silent_and_lazy_means_idle(domain, tmp_path):
             peer.spin(0.3)
         assert len(rig.odometry) == answered
         finding(peer, "estimates", "disabled by ~/enable")
-        assert count(peer, "estimates", "dropped: disabled by ~/enable") == 3
+        peer.wait(lambda: count(peer, "estimates", "dropped: disabled by ~/enable") == 3, what="three dropped pairs")
         assert peer.call(SetBool, f"{NODE}/enable", SetBool.Request(data=True)).success
         rig.answer()
         for subscription in list(peer.node.subscriptions):
