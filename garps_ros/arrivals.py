@@ -6,12 +6,28 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+import numpy.typing as npt
+
+from garps_core.checks import Float64Array
 
 WINDOW = 100
 """Arrivals that statistics look back on."""
 MANY_MISSING = 0.3
 PAUSE_S = 5.0
-"""A gap this long is no loss on the way: the publisher has paused."""
+"""A gap this long is no loss: the publisher has paused."""
+NEAR = 0.25
+"""A gap this near to a whole number of periods, in periods, counts as that many."""
+LONG = 3
+"""A gap of more periods is none that jitter makes; the error of the period is then too large to ask how near it is."""
+STEADY = 6
+"""So many equal gaps in a row are a period of their own: chance loses messages less evenly."""
+SURE_SIGMAS = 3.0
+"""Gaps are of a period when this many standard deviations more of them are near than would be by chance."""
+SPREAD = 6.0
+"""Gaps that differ by this factor, the extreme tenths left out, are loss even where no period is found."""
+ROUNDS = 20
+FEW = 20
+"""Fewer messages say nothing of loss."""
 
 
 class Arrivals:
@@ -57,10 +73,46 @@ class Arrivals:
         return 1000 * float(np.median(self._delays_s)), 1000 * max(self._delays_s)
 
     def missing(self) -> float:
-        """Share of messages that seem to have been lost on the way, from gaps between stamps; 0 while unknown."""
-        if len(self._stamps_s) < 10:
+        """Share of messages that seem to have been lost, from gaps between stamps; 0 while unknown.
+
+        Lost are those between stamps a whole multiple of the period apart. Jitter makes other gaps, and a camera that
+        slows down, as for its exposure, many equal ones: both are no loss.
+        """
+        if len(self._stamps_s) < FEW:
             return 0.0
-        gaps = np.diff(np.asarray(self._stamps_s))
-        # A low percentile is one period even where most messages are lost, and is no single burst either.
-        period = float(np.percentile(gaps, 10))
-        return max(0.0, 1.0 - len(gaps) * period / float(gaps.sum()))
+        multiples = _multiples(np.diff(np.asarray(self._stamps_s)))
+        lost = float((multiples - 1)[(multiples > 1) & ~_in_long_run(multiples)].sum())
+        return lost / (lost + len(multiples))
+
+
+def _multiples(gaps_s: Float64Array) -> Float64Array:
+    """How many periods each gap is long; 0 where that is no whole number, or cannot be told."""
+    ordered_s = np.sort(gaps_s)
+    tenth = len(gaps_s) // 10
+    far_apart = ordered_s[-1 - tenth] > SPREAD * ordered_s[tenth]
+    best = np.rint(gaps_s / _refined_s(tenth, ordered_s)) if far_apart else np.zeros_like(gaps_s)
+    highest = SURE_SIGMAS
+    for share in (50, 25, 10, 5, 2):  # from the largest: of two periods that explain as much the one with less loss
+        periods = gaps_s / _refined_s(len(gaps_s) * share // 100, ordered_s)
+        multiples = np.rint(periods)
+        near, long = np.abs(periods - multiples) < NEAR, multiples > LONG
+        short = np.count_nonzero(~long)
+        # By chance half of the gaps are near.
+        sigmas = (2 * np.count_nonzero(near & ~long & (multiples > 0)) - short) / np.sqrt(short)
+        if sigmas > highest:
+            best, highest = np.where(near | long, multiples, 0.0), sigmas
+    return best
+
+
+def _refined_s(index: int, ordered_s: Float64Array) -> float:
+    """The median of the gaps of one period, s; starts at the gap of that index, which may be too short for it."""
+    for _ in range(ROUNDS):
+        index = (int(np.searchsorted(ordered_s, 1.5 * ordered_s[index])) - 1) // 2
+    return float(ordered_s[index])
+
+
+def _in_long_run(multiples: Float64Array) -> npt.NDArray[np.bool_]:
+    """For each gap whether it is one of `STEADY` or more equal ones in a row."""
+    ends = np.flatnonzero(np.diff(multiples)) + 1
+    lengths = np.diff([0, *ends, len(multiples)])
+    return np.repeat(lengths >= STEADY, lengths)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from recordings import SECOND, START
 
-from garps_ros.arrivals import MANY_MISSING, PAUSE_S, WINDOW, Arrivals
+from garps_ros.arrivals import FEW, MANY_MISSING, PAUSE_S, WINDOW, Arrivals
 
 
 def arrived(stamps_s, times_s=None, delay_s=0.0):
@@ -86,6 +86,44 @@ def test_the_jitter_of_a_driver_is_no_loss(seed):
     assert lossy(0.5, jitter=0.1, seed=seed).missing() == pytest.approx(0.5, abs=0.13)
 
 
+def most_missing(stamps_s):
+    """The largest share that was ever said while these came in."""
+    arrivals, shares = Arrivals(), []
+    for stamp in stamps_s:
+        arrivals.note(float(stamp), START + round(stamp * SECOND), 0)
+        shares.append(arrivals.missing())
+    return max(shares)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["uniform", "normal"])
+def test_even_jitter_of_a_third_of_the_period_is_no_loss(seed, kind):
+    rng = np.random.default_rng(seed)
+    jitter = rng.uniform(-0.3, 0.3, 300) if kind == "uniform" else 0.2 * rng.normal(size=300)
+    assert most_missing((np.arange(300) + jitter) / 15) < MANY_MISSING / 2
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.1])
+@pytest.mark.parametrize(("before", "after"), [(30, 15), (15, 30), (30, 10), (30, 20), (30, 12)])
+def test_another_rate_is_no_loss(before, after, jitter):
+    """Drivers expose longer in the dark."""
+    stamps = np.cumsum(np.repeat([1 / before, 1 / after], 150))
+    stamps += jitter / 30 * np.random.default_rng(0).uniform(-1, 1, len(stamps))
+    assert most_missing(stamps) < MANY_MISSING / 2
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("share", [0.5, 0.6, 0.83])
+def test_loss_is_seen_through_jitter_and_at_any_time(share, seed):
+    rng = np.random.default_rng(seed)
+    stamps = (np.arange(2000) + rng.uniform(-0.1, 0.1, 2000)) / 15
+    arrivals, shares = Arrivals(), []
+    for stamp in stamps[rng.random(2000) >= share]:
+        arrivals.note(float(stamp), START + round(stamp * SECOND), 0)
+        shares.append(arrivals.missing())
+    assert min(shares[WINDOW:]) > 1.15 * MANY_MISSING
+
+
 def test_bursts_on_arrival_are_no_loss():
     stamps = np.arange(200) / 15
     assert arrived(stamps, np.ceil(stamps)).missing() == pytest.approx(0, abs=1e-4)
@@ -112,9 +150,10 @@ def test_a_long_gap_short_of_a_pause_is_loss():
 
 
 def test_few_messages_say_nothing_of_loss():
-    gaps = [1, 3, 1, 4, 1, 5, 1, 9, 2]
+    gaps = [1, 3, 1, 4, 1, 5, 1, 9, 2, 1, 3, 1, 4, 1, 5, 1, 9, 2, 1]
     stamps = np.cumsum([0, *gaps]) / 10
-    assert arrived(stamps[:9]).missing() == 0 and arrived(stamps).missing() == pytest.approx(1 - 9 / 27, abs=1e-4)
+    assert arrived(stamps[: FEW - 1]).missing() == 0
+    assert len(stamps) == FEW and arrived(stamps).missing() == pytest.approx(1 - 19 / 55, abs=1e-4)
 
 
 def test_a_recording_that_begins_again_is_no_loss():
