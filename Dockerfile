@@ -3,8 +3,11 @@
 # toolkit). Not built by continuous integration, and not built yet at all; the steps are those of docs/robot.md.
 #
 #   docker build -t garps .
-#   docker run --rm -it --gpus all --net=host --ipc=host garps ros2 launch garps_ros garps.launch.py --show-args
+#   docker run --rm -it --gpus all --net=host --ipc=host garps                                   # pose_node
+#   docker run --rm -it --init --gpus all --net=host --ipc=host garps ros2 launch garps_ros garps.launch.py --show-args
 #
+# `docker stop` ends both in good order: the node itself is process 1, since `ros2 run` passes no signal on, and
+# STOPSIGNAL is SIGINT, the one signal on which `ros2 launch` ends its nodes; as process 1 it needs --init.
 # --net=host: DDS finds the cameras' drivers. --ipc=host: their images come through shared memory. Without a GPU leave out
 # --gpus all; parameter device stays cpu.
 FROM ros:jazzy-ros-base
@@ -34,4 +37,5 @@ RUN . /opt/ros/jazzy/setup.sh && venv/bin/python -m colcon build
 RUN printf '%s\n' '#!/bin/bash' 'set -e' 'source /ws/install/setup.bash' 'exec "$@"' > /entrypoint.sh \
  && chmod +x /entrypoint.sh
 ENTRYPOINT ["/entrypoint.sh"]
-CMD ["ros2", "run", "garps_ros", "pose_node"]
+STOPSIGNAL SIGINT
+CMD ["/ws/install/garps_ros/lib/garps_ros/pose_node"]

@@ -6,6 +6,7 @@ their place here, so the file itself runs; that the real ones accept it, only a 
 """
 
 import functools
+import json
 import os
 import re
 import runpy
@@ -316,6 +317,18 @@ def test_the_commands_of_the_pages_are_right(description: list[Any]) -> None:
         assert {name.partition(":=")[0] for flag, name in pairwise(rest) if flag == "-p"} <= names
         topics = {f"/{name.partition(':=')[0]}" for flag, name in pairwise(rest) if flag == "-r"}
         assert topics <= node_topics(), topics
+
+
+def test_the_container_starts_the_node_itself_and_stops_it_by_a_signal_that_it_hears() -> None:
+    """`ros2 run` as process 1 passes no signal on: `docker stop` would kill the node after 10 s."""
+    said = dict(line.split(" ", 1) for line in (ROOT / "Dockerfile").read_text("utf-8").splitlines() if " " in line)
+    (command,) = json.loads(said["CMD"])
+    folder = re.search(r"^install_scripts=\$base/(.*)$", (ROOT / "setup.cfg").read_text("utf-8"), re.M)
+    assert folder is not None
+    path, _, executable = command.rpartition("/")
+    assert path == f"{said['WORKDIR']}/install/garps_ros/{folder[1]}"
+    assert f'"{executable} = garps_ros.pose_node:' in (ROOT / "setup.py").read_text("utf-8")
+    assert f"signal.{said['STOPSIGNAL']}" in (ROOT / "garps_ros" / "pose_node.py").read_text("utf-8")
 
 
 def test_messages_that_the_page_explains_exist() -> None:
