@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 run garps_ros pose_node`: starts the node, and ends it in good order on SIGINT and SIGTERM.
 
-Exit code 0 = asked to stop, 2 = wrong parameters or no rclpy; 128 + n on a second signal.
+Exit code 0 = asked to stop, 1 = stalled (see STALL_S), 2 = wrong parameters or no rclpy; 128 + n on a second signal.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
+import time
 import traceback
 from types import FrameType
 from typing import Any
@@ -18,6 +20,12 @@ SPIN_S = 0.2
 """A signal is noticed at the latest after this; Python's handlers do not run while the executor waits."""
 PATIENCE_S = 3.0
 """How long a computation may go on after a signal before the process ends without it."""
+STALL_S = 20.0
+"""When the loop has not come round for so long the process ends and says where it was; a launch file starts it again.
+
+Its callbacks take milliseconds, so that is not the node's doing: a reader of Fast DDS 2.14 can loop for ever inside
+the call that takes a message, where neither Python's threads nor its signal handlers run. The watch is in C.
+"""
 
 HELP = """The pose of one camera in another, in metres with covariance, from two RGB-D cameras; or the path of one.
 
@@ -100,11 +108,16 @@ def _is_users(error: Exception) -> bool:
 
 
 def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
+    watched_s = -STALL_S
     while not stopped:
+        if time.monotonic() - watched_s > 1.0:
+            watched_s = time.monotonic()
+            faulthandler.dump_traceback_later(STALL_S, exit=True)
         try:
             executor.spin_once(timeout_sec=SPIN_S)
         except Exception as error:
             node.failed(error, traceback.format_exc())
+    faulthandler.dump_traceback_later(STALL_S, exit=True)
     if not node.stop(PATIENCE_S):  # it goes on in native code; the interpreter cannot be taken down under it
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node inside this process, with faults put into it: it says so, and goes on."""
 
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
 
 import pytest
-from graph import SECOND, Camera, Peer, private_domain, room_pair
+from graph import ROOT, SECOND, Camera, Peer, private_domain, room_pair
 
 pytest.importorskip("rclpy")
 import rclpy
@@ -191,3 +193,21 @@ def test_what_is_not_fit_to_use_is_not_published(domain, estimates, estimate, st
         assert node.says("estimates", status) == 1
         assert len(node.found) == before and node.node._health.used == used
         assert node.node._health.rejected.total() == 1
+
+
+def test_a_loop_that_stalls_ends_the_process_and_says_where():
+    """As when the call that takes a message never returns: nothing of Python runs then."""
+    code = """if True:
+        import time
+        from garps_ros import pose_node
+        class Executor:
+            def spin_once(self, timeout_sec):
+                stalled_in_here()
+        def stalled_in_here():
+            time.sleep(60)
+        pose_node.STALL_S = 0.5
+        pose_node._run(Executor(), None, None, [])
+    """
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30)
+    assert done.returncode == 1
+    assert "Timeout" in done.stderr and "stalled_in_here" in done.stderr
