@@ -9,10 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from garps_core.checks import Float64Array
+from garps_core.errors import ReconstructionError
 from garps_core.geometry import skew, so3_log
 from garps_core.types import PoseEstimate, View
 
 Estimator = Callable[[View, View], PoseEstimate]
+MIN_DEPTH_SHARE = 0.02
+"""A view with depth at a smaller share of its pixels begins no segment: a covered lens, not a sparse sensor."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,7 @@ class KeyframeRule:
         min_overlap: new keyframe when the overlap (0..1) falls below.
         max_motion_m: new keyframe beyond this distance, m.
         max_rotation_rad: new keyframe beyond this rotation, rad.
-        lost_after: frames in a row without a pose after which a new segment begins.
+        lost_after: usable views in a row without a pose after which a new segment begins.
     """
 
     min_overlap: float = 0.5
@@ -69,6 +72,8 @@ class KeyframeTracker:
         self._keyframe: _Located | None = None
         self._last: _Located | None = None
         self._failures = 0
+        self._was_blank = False
+        """Of the last view."""
         self.segment = segment
         """Counts from 1; poses of different segments are not related to each other."""
         self.keyframes = 0
@@ -79,8 +84,22 @@ class KeyframeTracker:
         return 0 if self._keyframe is None else self._keyframe.view.stamp_ns
 
     def begins(self, view: View) -> bool:
-        """Make the view the origin of a new segment if one is due: at the start, or when lost for too long."""
-        if self._keyframe is not None and self._failures < self.rule.lost_after:
+        """Make the view the origin of a new segment if one is due: at the start, or when lost for too long.
+
+        A view without enough depth begins none; while there is a keyframe, `follow` tries it all the same.
+
+        Raises:
+            ReconstructionError: the first segment is due, and the view has too little depth for its keyframe.
+        """
+        share = _depth_share(view)
+        if self._keyframe is None and share < MIN_DEPTH_SHARE:
+            raise ReconstructionError(
+                f"the view has depth at {share:.1%} of its pixels: expected at least {MIN_DEPTH_SHARE:.0%} to begin a "
+                "trajectory; uncover the camera, or check the depth topic"
+            )
+        # What was out of sight may be back after a blank view: the keyframe gets one more try.
+        patience = self.rule.lost_after + self._was_blank
+        if self._keyframe is not None and (self._failures < patience or share < MIN_DEPTH_SHARE):
             return False
         self.segment += 1
         self._failures = 0
@@ -91,9 +110,11 @@ class KeyframeTracker:
     def follow(self, view: View) -> Iterator[Attempt]:
         """Estimate the view against the keyframe and, where that fails, against the last good view.
 
-        Raises what the estimator raises; the view then counts as one without a pose.
+        Raises what the estimator raises; the view then counts as one without a pose. A view without enough depth to
+        begin a segment does not count.
         """
-        self._failures += 1
+        self._was_blank = _depth_share(view) < MIN_DEPTH_SHARE
+        self._failures += not self._was_blank
         for reference in self._references():
             estimate = self._estimate(view, reference.view)
             if not estimate.ok or estimate.T_target_source is None or estimate.covariance is None:
@@ -124,6 +145,10 @@ class KeyframeTracker:
             or float(np.linalg.norm(T[:3, 3])) > self.rule.max_motion_m
             or float(np.linalg.norm(so3_log(T[:3, :3]))) > self.rule.max_rotation_rad
         )
+
+
+def _depth_share(view: View) -> float:
+    return 0.0 if view.depth is None else float(np.isfinite(view.depth).mean())
 
 
 def composed_covariance(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of the replay by themselves: pairing by stamp, choice of topics, keyframes, views."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from recordings import COVARIANCE, estimate, moved, picture
 from ros_messages import LIBRARIES, camera_info, image
 from scipy.spatial.transform import Rotation
 
-from garps_core.errors import InputError
+from garps_core.errors import InputError, ReconstructionError
 from garps_core.geometry import se3_inverse
 from garps_core.types import View
 from garps_ros.bags import BagError
@@ -196,8 +197,26 @@ def test_a_stereo_pair_with_one_depth_is_one_camera_with_depth():
     assert camera.image == "/l/image"
 
 
-def view(index):
-    return View(rgb=picture(index), K=np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), stamp_ns=index)
+def view(index, share=1.0):
+    """A view with depth in a share of its pixels."""
+    depth = np.full((48, 64), np.nan, np.float32)
+    depth.flat[: round(share * depth.size)] = 2
+    return View(rgb=picture(index), K=np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), depth=depth, stamp_ns=index)
+
+
+def followed(tracker, views):
+    """For each view: "begins", "pose", "none" or the error."""
+    said = []
+    for each in views:
+        try:
+            said.append("begins" if tracker.begins(each) else ["none", "pose"][_located(tracker.follow(each))])
+        except ReconstructionError as error:
+            said.append(str(error))
+    return said
+
+
+def _located(attempts):
+    return any(attempt.T_start_source is not None for attempt in attempts)
 
 
 def test_small_overlap_and_rotation_also_take_a_keyframe():
@@ -209,6 +228,50 @@ def test_small_overlap_and_rotation_also_take_a_keyframe():
         assert tracker.begins(view(1)) and not tracker.begins(view(2))
         targets = [attempt.target.stamp_ns for index in (2, 3) for attempt in tracker.follow(view(index))]
         assert targets == [1, 2] and tracker.keyframes == 3
+
+
+@pytest.mark.parametrize("blank", [0.0, 0.0199, None])
+def test_only_a_view_with_depth_begins_a_trajectory(blank):
+    tracker = KeyframeTracker(estimate, KeyframeRule())
+    covered = view(1, blank or 0) if blank is not None else replace(view(1), depth=None)
+    refused, *rest = followed(tracker, [covered, view(2, 0.021), view(3)])
+    told = f"{100 * (blank or 0):.1f}%"
+    assert (
+        refused.startswith(f"the view has depth at {told} of its pixels: expected at least 2%") and "topic" in refused
+    )
+    assert rest == ["begins", "pose"] and tracker.segment == 1
+
+
+def test_a_hand_over_the_lens_does_not_end_the_trajectory():
+    """However long, also where it made usable views fail before."""
+    bad = {*range(3, 6), *range(10, 40)}
+    tracker = KeyframeTracker(lambda s, t: estimate(s, t, bad=bad), KeyframeRule(max_motion_m=99, lost_after=3))
+    hand = {4, *range(12, 40)}
+    said = followed(tracker, [view(index, 0.0 if index in hand else 1.0) for index in range(1, 45)])
+    assert said.count("begins") == 1 and said[0] == "begins" and set(said[39:]) == {"pose"}
+    assert tracker.segment == tracker.keyframes == 1
+
+
+@pytest.mark.parametrize("lost_after", [1, 3, 5])
+def test_a_trajectory_begins_after_as_many_usable_views_as_asked_for(lost_after):
+    for failing, expected in ((lost_after - 1, "pose"), (lost_after, "begins")):
+        bad = range(2, 2 + failing)
+        rule = KeyframeRule(0, 99, 9, lost_after)
+        tracker = KeyframeTracker(lambda s, t, bad=bad: estimate(s, t, bad=bad), rule)
+        said = followed(tracker, map(view, range(1, 3 + failing)))
+        assert said == ["begins", *["none"] * failing, expected]
+
+
+def test_a_keyframe_back_in_sight_after_a_blank_view_goes_before_a_new_trajectory():
+    for bad, last in (((2, 3), "pose"), ((2, 3, 5, 7), "begins")):
+        tracker = KeyframeTracker(lambda s, t, bad=bad: estimate(s, t, bad=(4, 6, *bad)), KeyframeRule(0, 99, 9, 2))
+        said = followed(tracker, [view(1), view(2), view(3), view(4, 0), view(5), view(6, 0), view(7)])
+        assert said[:4] == ["begins", "none", "none", "none"] and said[-1] == last, "one more try, not for ever"
+
+
+def test_segments_go_on_from_an_earlier_tracker():
+    tracker = KeyframeTracker(estimate, KeyframeRule(), segment=4)
+    assert tracker.segment == 4 and tracker.begins(view(1)) and tracker.segment == 5
 
 
 def turned(source, target):
