@@ -129,6 +129,9 @@ def replay(
     ] = 0.5,
     keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
     keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
+    keyframe_lost_after: Annotated[
+        int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
+    ] = 5,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Annotated[str, typer.Option(help="Settings: default, sensor, monocular or paper.")] = "default",
     set_: Annotated[
@@ -147,7 +150,7 @@ def replay(
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
     _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
     config = changed_config(Config.preset(preset), set_ or [])
-    rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation))
+    rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after)
     source = CameraTopics(source_image, source_info, source_depth)
     target = CameraTopics(target_image, target_info, target_depth)
     with Bag(bag) as recording:

@@ -15,6 +15,7 @@ from garps_ros import parameter_docs
 from garps_ros.parameters import parameters, settings_from
 from garps_ros.replay import replay
 from garps_ros.settings import NodeSettings
+from garps_ros.tracking import KeyframeRule
 
 ROOT = Path(__file__).resolve().parent.parent
 PRESETS = ("default", "sensor", "monocular", "paper")
@@ -97,12 +98,17 @@ def test_the_groups() -> None:
         ("keyframe_overlap", "keyframe_overlap"),
         ("keyframe_motion", "keyframe_motion"),
         ("keyframe_rotation", "keyframe_rotation"),
+        ("keyframe_lost_after", "keyframe_lost_after"),
         ("rectified", "rectified"),
         ("preset", "preset"),
     ],
 )
 def test_the_node_and_the_replay_have_the_same_defaults(own: str, option: str) -> None:
     assert getattr(NodeSettings(), own) == inspect.signature(replay).parameters[option].default
+
+
+def test_the_tracker_has_the_default_too() -> None:
+    assert KeyframeRule().lost_after == NodeSettings().keyframe_lost_after
 
 
 def test_values_reach_the_settings() -> None:

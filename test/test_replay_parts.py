@@ -2,19 +2,21 @@
 """The parts of the replay by themselves: pairing by stamp, choice of topics, keyframes, views."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import COVARIANCE, estimate, moved, picture
+from recordings import COVARIANCE, estimate, frames, moved, picture, write
 from ros_messages import LIBRARIES, camera_info, image
 from scipy.spatial.transform import Rotation
 
 from garps_core.errors import InputError, ReconstructionError
 from garps_core.geometry import se3_inverse
 from garps_core.types import View
+from garps_ros import replay
 from garps_ros.bags import BagError
 from garps_ros.cameras import CameraTopics
 from garps_ros.pairing import MAX_WAITING, Pairer
@@ -260,6 +262,14 @@ def test_a_trajectory_begins_after_as_many_usable_views_as_asked_for(lost_after)
         tracker = KeyframeTracker(lambda s, t, bad=bad: estimate(s, t, bad=bad), rule)
         said = followed(tracker, map(view, range(1, 3 + failing)))
         assert said == ["begins", *["none"] * failing, expected]
+
+
+@pytest.mark.parametrize(("lost_after", "segments"), [(2, 2), (3, 1)])
+def test_the_replay_is_told_after_how_many(tmp_path, monkeypatch, lost_after, segments):
+    monkeypatch.setattr(replay, "estimate_relative_pose", partial(estimate, bad=(3, 4)))
+    bag, out = write(tmp_path, "mcap", frames(["/cam"], 6, "rosbags")), tmp_path / "out"
+    assert replay.main([str(bag), "--out", str(out), "--keyframe-lost-after", str(lost_after)]) == 0
+    assert len(list(out.glob("trajectory*.tum"))) == segments
 
 
 def test_a_keyframe_back_in_sight_after_a_blank_view_goes_before_a_new_trajectory():
