@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from garps_core.config import Checked, setting
+from garps_core.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class NodeSettings(Checked, prefix=""):
         0.0, "most pairs per second, 0 = as fast as the machine allows", unit="Hz", low=0, high=1000
     )
     prior_max_age: float = setting(
-        0.5,
-        "a prior whose stamp differs more from the source image's is not used; one with zero stamp always is",
+        0.1,
+        "a prior whose stamp differs more from the source image's is not used, for its covariance is taken as it is, "
+        "however far the camera has moved since; one with zero stamp always is used",
         unit="s",
         low=0,
         high=1e6,
@@ -74,3 +76,11 @@ class NodeSettings(Checked, prefix=""):
     stage_timeout: float = setting(
         10.0, "a computation that takes longer is reported as stuck", unit="s", low=0.1, high=3600
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.source_frame and self.source_frame == self.target_frame:
+            raise ConfigError(
+                f"source_frame and target_frame are both {self.source_frame!r}: expected two names, for the pose is of "
+                "the one in the other; change one, or leave it empty for the frame_id of the images"
+            )

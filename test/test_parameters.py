@@ -123,6 +123,10 @@ WRONG = {
     "preset": ({"preset": "x"}, "preset is 'x': expected one of default, sensor, monocular, paper"),
     "range": ({"sync_slop": 11.0}, "sync_slop is 11.0: expected between 0 and 10 s"),
     "range of the estimator": ({"lifting__stride": 0}, "lifting.stride is 0: expected between 1 and 32 px"),
+    "frame in itself": (
+        {"source_frame": "cam", "target_frame": "cam"},
+        "source_frame and target_frame are both 'cam': expected two names",
+    ),
     "not a number": ({"max_rate": float("nan")}, "max_rate is nan: expected between 0 and 1000 Hz"),
     "no part": ({"dtype": "float16"}, "dtype is 'float16': expected one of float32, float64"),
     "text for flag": ({"lazy": "yes"}, "lazy is 'yes': expected True or False"),
@@ -137,6 +141,17 @@ def test_a_wrong_value_is_one_line_that_teaches(changes: dict[str, object], text
     with pytest.raises(ConfigError) as raised:
         settings_from(values_of(**changes))
     assert str(raised.value).startswith(text)
+
+
+def test_frames_may_have_two_names_or_none() -> None:
+    assert settings_from(values_of())[0].source_frame == ""
+    node, _ = settings_from(values_of(source_frame="cam", target_frame="map"))
+    assert (node.source_frame, node.target_frame) == ("cam", "map")
+
+
+def test_a_prior_of_another_moment_is_not_used_unless_asked_for() -> None:
+    """At 1 m/s the camera is 0.1 m from it; its covariance knows nothing of that."""
+    assert NodeSettings().prior_max_age <= 0.1
 
 
 def test_a_missing_value_is_named() -> None:
