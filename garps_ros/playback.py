@@ -40,9 +40,9 @@ LEAD_S = 0.1
 """Wall time that /clock runs before the first message."""
 LATE_S = 0.2
 """Wall time behind the recording from which on it is said."""
-SETTLE_S = 1.5
+SETTLE_S = 0.6
 """How long nothing may be added before the listeners count as complete: subscriptions are matched one after another,
-and `pose_node`, which looks at the publishers once a second, then subscribes anew with the QoS that they offer."""
+and `pose_node`, which looks at the publishers every 0.2 s, then subscribes anew with the QoS that they offer."""
 PATIENCE_S = 3.0
 """The same while the graph shows more subscriptions than are matched; some never are, for their QoS."""
 DELIVERY_S = 5.0
@@ -51,8 +51,6 @@ DELIVERY_S = 5.0
 # What rclpy and rclcpp subscribe /clock with, and what rosbag2 offers.
 CLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 Say = Callable[[str], None]
-
-atexit.register(gc.freeze)  # else Python walks through all of torch once more before it ends: a second after Ctrl-C
 
 
 def play(path: Path, rate: float, loop: bool, topics: list[str], wait_s: float) -> int:
@@ -69,6 +67,7 @@ def play(path: Path, rate: float, loop: bool, topics: list[str], wait_s: float) 
     """
     if not 0 < rate < float("inf"):
         raise BagError(f"--rate is {rate}: expected a speed above 0, such as 0.5 or 2")
+    atexit.register(gc.freeze)  # else Python walks through all of torch once more before it ends: a second after Ctrl-C
     # Plain text: a topic must not be broken over two lines.
     console = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
     with RawBag(path) as bag, stop_on_signals() as stopped, _node() as node:

@@ -282,6 +282,17 @@ def test_an_interruption_ends_it_at_once(domain, tmp_path, number):
     assert process.returncode == 130 and "Traceback" not in errors
 
 
+@pytest.mark.parametrize(("step", "frozen"), [("", False), ("playback.play(Path('nothing'), 1, False, [], 0)", True)])
+def test_only_playing_changes_how_the_process_ends(step, frozen):
+    """The one registered first is called last."""
+    code = (
+        "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count() > 0))\n"
+        f"from pathlib import Path; from garps_ros import playback; {step}"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.stdout.strip() == str(frozen), done.stderr
+
+
 WITHOUT_RCLPY = (
     "import sys; sys.modules['rclpy'] = None; from garps_ros import replay; sys.exit(replay.main(sys.argv[1:]))"
 )
