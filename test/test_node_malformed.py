@@ -24,9 +24,10 @@ class Trial:
         self.rig = Rig(peer, room_pair(), **how)
         self.priors = peer.publisher(PoseWithCovarianceStamped, "/pose_node/prior")
         self.poses = peer.collect(PoseStamped, "/pose_node/pose")
-        self.rig.publish_until(lambda: self.poses, "a first pose")
+        # Nothing is sent before: Fast DDS 2.14 can loop for ever in a reliable reader that joins large messages midway.
         peer.wait(lambda: str(self.values("inputs")).count("RELIABLE") == 7, what="subscriptions to be final")
-        peer.matched(self.priors)
+        peer.matched(self.priors, *self.rig.source.publishers, *self.rig.target.publishers)
+        self.rig.publish_until(lambda: self.poses, "a first pose")
         self.settle()
 
     def values(self, part: str) -> dict[str, str]:
@@ -325,30 +326,29 @@ PRIORS = {
     "NaN covariance": ({"covariance": np.full((6, 6), np.nan)}, "covariance holds NaN"),
     "quaternion of length two": ({"quaternion": (0.0, 0.0, 0.0, 2.0)}, "quaternion"),
     "quaternion of zeros": ({"quaternion": (0.0, 0.0, 0.0, 0.0)}, "quaternion"),
-    "another frame": ({"frame_id": "base_link"}, "prior is in frame 'base_link'"),
 }
 
 
 @pytest.mark.parametrize("name", PRIORS)
-def test_a_prior_that_cannot_be_used_is_left_out_and_said(raw, name):
+def test_a_prior_that_cannot_be_used_is_refused_and_the_pair_answered_without(raw, name):
     fields, reason = PRIORS[name]
     before, _ = raw.complaints()["refused"]
-    source, target = raw.pair()
-    raw.priors.publish(prior(raw.rig.stamp_ns, **fields))
-    raw.send(source, target)
-    raw.peer.wait(lambda: raw.poses, what="the pose without the prior")
-    raw.complains("refused", before, reason)
-    assert reason in raw.values("estimates")["prior"]
-    raw.poses.clear()
+    raw.priors.publish(prior(raw.rig.stamp_ns + SECOND, **fields))
     raw.answers()
+    raw.complains("refused", before, reason)
+    assert raw.values("estimates")["prior"] == "none"
+
+
+def test_a_prior_in_another_frame_is_not_used(raw):
+    raw.priors.publish(prior(raw.rig.stamp_ns + SECOND, frame_id="base_link"))
+    raw.answers()
+    raw.peer.wait(lambda: "prior is in frame 'base_link'" in raw.values("estimates")["prior"], what="the reason")
 
 
 def test_a_good_prior_is_used_after_all_those(raw):
-    source, target = raw.pair()
-    raw.priors.publish(prior(raw.rig.stamp_ns))
-    raw.send(source, target)
-    raw.peer.wait(lambda: raw.values("estimates").get("prior") == "used", what="the prior to be used")
-    raw.settle()
+    raw.priors.publish(prior(raw.rig.stamp_ns + SECOND))
+    raw.answers()
+    raw.peer.wait(lambda: raw.values("estimates")["prior"] == "used", what="the prior to be used")
 
 
 def test_a_prior_before_1970_is_refused_on_arrival(raw):
