@@ -36,7 +36,7 @@ class NodeSettings(Checked, prefix=""):
     )
     image_qos: str = setting(
         "auto",
-        "reliability of the image subscriptions; auto = as the publishers offer",
+        "reliability of the image subscriptions; auto = best effort, reliable where images get lost and it is offered",
         choices=("auto", "reliable", "best_effort"),
         live=False,
     )

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions that ask for what the publishers offer, store references only, and know why nothing arrives."""
+"""Subscriptions that ask for what suits their publishers, store references only, and know why nothing arrives.
+
+Images are asked for as best effort while they get through. Reliable is for those that do not (beyond 0.5 MB Fast DDS
+loses most of them in its default setting), and not for all: Fast DDS 2.14 can loop for ever in a reliable reader that
+joins messages of more than 64 KB midway, about once in 150 starts, with more shared memory once in 10.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +16,13 @@ from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEve
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
-from garps_ros.arrivals import Arrivals
+from garps_ros.arrivals import MANY_MISSING, Arrivals
 from garps_ros.health import InputState
 
-DEPTH = 10
+QUEUE = 10
 """Messages that wait for the executor; at 30 Hz a third of a second."""
+NOTHING_S = 3.0
+"""When nothing has come for so long from publishers that are there, it is being lost."""
 
 
 class Input:
@@ -26,7 +33,7 @@ class Input:
         role: name for people, "source/image".
         kind: message class.
         topic: as the node would write it, before remapping; or a full name.
-        reliability: "auto" (as the publishers offer), "reliable" or "best_effort".
+        reliability: "auto", "reliable" or "best_effort".
         received: called with every message.
         say: called with a line when QoS does not match.
         once: one message is enough (a calibration); then a latched one is asked for where it is offered.
@@ -51,6 +58,7 @@ class Input:
         self.topic = node.resolve_topic_name(topic)
         self.arrivals = Arrivals()
         self._publishers = 0
+        self._offered_since_s: float | None = None
         self._problem = ""
         # Until a publisher is there: best effort hears everyone.
         self._qos = _profile(reliability == "reliable", latched=False)
@@ -64,15 +72,23 @@ class Input:
         self._problem = self._type_problem(offers) or self._qos_problem(offers)
         if not offers:
             return
-        reliable = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+        offered = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-        if self._reliability != "auto":
-            reliable = self._reliability == "reliable"
+        reliable = self._reliability == "reliable" or (self._reliability == "auto" and offered and self._needs_it())
         wanted = _profile(reliable, latched and reliable and self._once)
         if (wanted.reliability, wanted.durability) != (self._qos.reliability, self._qos.durability):
             self._node.destroy_subscription(self._subscription)
             self._qos = wanted
             self._subscription = self._subscribe()
+
+    def _needs_it(self) -> bool:
+        """Whether best effort is not enough: a calibration must not be lost, and images are being lost."""
+        if self._once or self._qos.reliability == ReliabilityPolicy.RELIABLE:
+            return True
+        now_s = time.monotonic()
+        self._offered_since_s = self._offered_since_s or now_s
+        never = self.arrivals.count == 0 and now_s - self._offered_since_s > NOTHING_S
+        return never or self.arrivals.missing() > MANY_MISSING
 
     def state(self) -> InputState:
         """For the diagnostics."""
@@ -122,7 +138,7 @@ class Input:
 def _profile(reliable: bool, latched: bool) -> QoSProfile:
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
+        depth=QUEUE,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from graph import SECOND, Camera, NodeProcess, Peer, private_domain, room_pair
-from ros_messages import ROS2
+from ros_messages import ROS2, image
 
 from garps_core import Config, Prior, Status, estimate_relative_pose
 from garps_core.settings import changed_config
@@ -128,14 +128,14 @@ def finding(peer, name, text):
 TRANSPORTS = {
     "raw_reliable": ({"depth": "16UC1", "reliable": True}, []),
     "raw_best_effort": ({"depth": "32FC1", "reliable": False}, []),
-    "asked_for_best_effort": ({"depth": "16UC1", "reliable": True}, ["image_qos=best_effort"]),
+    "asked_for_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=reliable"]),
     "jpeg_and_compressed_depth": (
         {"colour": "jpeg", "depth": "compressedDepth"},
         ["image_transport=compressed", "depth_transport=compressedDepth"],
     ),
     "png_best_effort": (
         {"colour": "png", "depth": "png", "reliable": False},
-        ["image_transport=compressed", "depth_transport=compressed", "image_qos=reliable"][:2],
+        ["image_transport=compressed", "depth_transport=compressed"],
     ),
 }
 
@@ -153,9 +153,7 @@ def test_two_cameras_give_the_offline_pose(domain, tmp_path, name):
         assert odometry.child_frame_id == "source_optical"
         level = finding(peer, "inputs", "all inputs arrive")
         assert level == 0
-        expected = (
-            "RELIABLE" if how.get("reliable", True) and "image_qos=best_effort" not in settings else "BEST_EFFORT"
-        )
+        expected = "RELIABLE" if "image_qos=reliable" in settings else "BEST_EFFORT"
         assert expected in values(peer, "inputs")["source/image"]
 
 
@@ -320,6 +318,23 @@ def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
         assert (
             finding(peer, "inputs", "peer publishes sensor_msgs/msg/PointCloud2, expected sensor_msgs/msg/Image") == 2
         )
+
+
+@pytest.mark.parametrize("offered", ["RELIABLE", "BEST_EFFORT"])
+def test_images_that_get_lost_are_asked_for_reliably_where_that_is_offered(domain, tmp_path, offered):
+    from sensor_msgs.msg import Image
+
+    with running(domain, tmp_path) as (_, peer):
+        images = peer.publisher(Image, "source/image", reliable=offered == "RELIABLE")
+        peer.matched(images)
+        kept = [step for step in range(120) if np.random.default_rng(step).random() < 0.4]
+        for step in kept:
+            stamp_ns = 1_700_000_000 * SECOND + step * SECOND // 30
+            images.publish(image(np.zeros((8, 8, 3), np.uint8), "rgb8", "rclpy", stamp_ns=stamp_ns))
+            peer.spin(0.03)
+        peer.wait(lambda: offered in values(peer, "inputs").get("source/image", ""), what=offered)
+        peer.spin(1.2)
+        assert offered in values(peer, "inputs")["source/image"]
 
 
 def test_missing_inputs_are_named(domain, tmp_path):
