@@ -35,7 +35,7 @@ from bench.rooms import RoomPair, make_pair
 from msg_adapters import ns_to_stamp, stamp_to_ns
 
 ROOM_SEED, ROOM_LEVEL = 3, 2
-SLOW = ["lifting.stride:=1", "start.max_features:=20000", "dtype:=float64", "alignment.partner_density:=8.0"]
+SLOW = ["lifting.stride:=1", "alignment.solver:=adam"]
 """Settings under which a pair of 640x480 takes 1.5 s and more on two cores; nobody would want them."""
 CHEAP = ["lifting.stride:=8", "start.max_features:=300"]
 WARM_UP = 3

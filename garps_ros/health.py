@@ -80,6 +80,9 @@ class Health:
     errors: Counter[str] = field(default_factory=Counter)
     """Errors of the node itself: worker deaths, callbacks."""
     last_error: str = ""
+    restarts: int = 0
+    """How often everything of before has been forgotten: resets, time going back."""
+    last_restart: str = ""
     facts: dict[str, str] = field(default_factory=dict)
     """Of the last estimate: overlap, keyframe, prior."""
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
@@ -172,6 +175,7 @@ class Health:
         values |= {f"dropped: {reason}": str(count) for reason, count in sorted(self.dropped.items())}
         values |= {f"rejected: {status}": str(count) for status, count in sorted(self.rejected.items())}
         values["last rejected"] = self.last_rejected
+        values["began anew"] = f"{self.restarts}, last: {self.last_restart}" if self.restarts else "0"
         values |= self._latency_values() | self.facts
         return Finding("estimates", level, message, values)
 

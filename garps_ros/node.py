@@ -217,6 +217,7 @@ class PoseNode:
         self._generation += 1
         self._priors.forget()
         self._health.facts.clear()
+        self._health.restarts, self._health.last_restart = self._health.restarts + 1, why
         self._withdraw()
         self._log.warn("forget", f"{why}: beginning anew")
 

@@ -304,6 +304,7 @@ def test_with_simulated_time_and_a_recording_that_begins_again(domain, tmp_path)
             play(step + 0.5)
         peer.wait(lambda: rig.answers(start + round(3.5 * SECOND)), what="a pose after the jump back")
         assert re.search(r"(went back|time went back) by .*beginning anew", node.log())
+        peer.wait(lambda: "went back" in values(peer, "estimates")["began anew"], what="the restart in the diagnostics")
 
 
 def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
