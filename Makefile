@@ -28,7 +28,7 @@ test: $(VENV)/.test
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
-	$(PY) -m pytest --cov --cov-report=term
+	$(PY) -m pytest -n 2 --dist loadfile --cov --cov-report=term  # a file at a time: tests of the node mostly wait
 
 bench: $(VENV)/.test
 	$(PY) -m bench.speed

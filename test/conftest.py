@@ -3,6 +3,7 @@
 
 import os
 
+import pytest
 from hypothesis import settings
 
 # Without this, Jazzy accepts a scalar of the wrong type and publishes garbage for it.
@@ -13,3 +14,12 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 settings.register_profile("garps", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile(os.environ.get("GARPS_TEST_PROFILE", "garps"))
+
+
+@pytest.fixture(scope="module")
+def domain(tmp_path_factory):
+    """A ROS domain that nobody else on this machine uses, for the tests of one file."""
+    from graph import private_domain
+
+    with private_domain(tmp_path_factory.mktemp("ros")) as held:
+        yield held

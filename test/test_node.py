@@ -1,129 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """pose_node as a process on a real graph: what goes in by topic comes out as the pose the offline path finds."""
 
-import re
-import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from graph import SECOND, Camera, NodeProcess, Peer, private_domain, room_pair
-from ros_messages import ROS2, image
+from graph import SECOND, room_pair
+from node_rig import CHEAP, EQUAL, NODE, Rig, assert_equal, count, finding, offline, running, values
+from ros_messages import ROS2
 
-from garps_core import Config, Prior, Status, estimate_relative_pose
-from garps_core.settings import changed_config
-from garps_ros.views import view_from_messages
+from garps_core import Prior
 from msg_adapters import PoseWriter, header_stamp_ns, pose_from_message
 
 pytest.importorskip("rclpy")
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from garps_ros.publishing import message_class
-
-NODE = "/pose_node"
-EQUAL = 1e-6
-"""m, rad and their squares: how close the live pose is to the offline one."""
-CHEAP = ["lifting.stride=4", "start.max_features=1000"]
-
-
-@pytest.fixture(scope="module")
-def domain(tmp_path_factory):
-    with private_domain(tmp_path_factory.mktemp("ros")) as held:
-        yield held
-
-
-@contextmanager
-def running(domain, tmp_path, settings=(), remaps=()):
-    """A node with settings like "pairing=keyframe", and a peer; both end in good order."""
-    words = [word for setting in [*CHEAP, *settings] for word in ("-p", setting.replace("=", ":=", 1))]
-    words += [word for remap in remaps for word in ("-r", remap)]
-    with (
-        NodeProcess(["--ros-args", *words], domain.environment, tmp_path / "node.log") as node,
-        Peer(domain) as peer,
-    ):
-        yield node, peer
-
-
-class Rig:
-    """Two cameras of a room pair, and the poses that come back."""
-
-    def __init__(self, peer, pair=None, **how):
-        self.peer = peer
-        self.cameras = [Camera(peer, side, pair or room_pair(), **how) for side in ("source", "target")]
-        self.poses = peer.collect(PoseStamped, f"{NODE}/pose")
-        self.odometry = peer.collect(Odometry, f"{NODE}/odometry")
-        self._stamp_ns = 1_700_000_000 * SECOND
-
-    def ready(self):
-        """The node hears every topic, and somebody hears the node."""
-        for camera in self.cameras:
-            self.peer.matched(*camera.publishers)
-        self.peer.wait(lambda: self.peer.node.count_publishers(f"{NODE}/pose"), what="the node's publisher")
-        return self
-
-    def send(self, stamp_ns=None):
-        """Publish a pair; returns its stamp and the two shots."""
-        self._stamp_ns = self._stamp_ns + SECOND // 10 if stamp_ns is None else stamp_ns
-        shots = [camera.shot(self._stamp_ns) for camera in self.cameras]
-        for camera, shot in zip(self.cameras, shots, strict=True):
-            camera.send(shot)
-        return self._stamp_ns, shots
-
-    def answers(self, stamp_ns):
-        return [message for _, message in self.odometry if header_stamp_ns(message) == stamp_ns]
-
-    def answer(self, seconds=30.0):
-        """Send pairs until one is answered; returns its shots, PoseStamped and Odometry.
-
-        The first messages after a match may be lost, as on every graph; that is why pairs are sent again.
-        """
-        end, sent = time.monotonic() + seconds, {}
-        while time.monotonic() < end:
-            stamp_ns, shots = self.send()
-            sent[stamp_ns] = shots
-            again = time.monotonic() + 1.0
-            while time.monotonic() < again:
-                self.peer.spin(0.02)
-                for _, odometry in self.odometry:
-                    stamp_ns = header_stamp_ns(odometry)
-                    poses = [m for _, m in self.poses if header_stamp_ns(m) == stamp_ns]
-                    if stamp_ns in sent and poses:
-                        return sent[stamp_ns], poses[0], odometry
-        pytest.fail(f"no pose for any pair; diagnostics: {self.peer.diagnostics()}")
-
-
-def offline(shots, settings=(), prior=None):
-    config = changed_config(Config(), [*CHEAP, *settings])
-    views = [view_from_messages(shot.image, shot.camera_info, shot.depth)[0] for shot in shots]
-    return estimate_relative_pose(*views, config, prior)
-
-
-def assert_equal(message, estimate):
-    T, covariance = pose_from_message(message)
-    assert estimate.status is Status.CONVERGED
-    np.testing.assert_allclose(T, estimate.T_target_source, atol=EQUAL)
-    if covariance is not None:
-        np.testing.assert_allclose(covariance, estimate.covariance, atol=EQUAL, rtol=EQUAL)
-
-
-def values(peer, name):
-    return peer.diagnostics().get(f"pose_node: {name}", (0, "", {}))[2]
-
-
-def count(peer, name, key):
-    return int(values(peer, name).get(key, 0))
-
-
-def finding(peer, name, text):
-    """Wait until a status says a text; returns its level."""
-    peer.wait(lambda: text in peer.diagnostics().get(f"pose_node: {name}", (0, "", {}))[1], what=f"{name}: {text!r}")
-    return peer.diagnostics()[f"pose_node: {name}"][0]
-
 
 TRANSPORTS = {
     "raw_reliable": ({"depth": "16UC1", "reliable": True}, []),
@@ -278,88 +173,6 @@ def test_clouds_show_the_alignment_to_whoever_subscribes(domain, tmp_path):
         assert min(len(a), len(b)) > 1000
         gaps = np.array([np.linalg.norm(b - point, axis=1).min() for point in a[::50]])
         assert np.median(gaps) < 0.04  # m; the cloud's own spacing, far less than between the cameras
-
-
-def test_with_simulated_time_and_a_recording_that_begins_again(domain, tmp_path):
-    with running(domain, tmp_path, ["use_sim_time=true"]) as (node, peer):
-        rig = Rig(peer).ready()
-        clock = peer.publisher(Clock, "/clock")
-        peer.matched(clock)
-        assert finding(peer, "inputs", "nothing has come on /clock") == 2
-        start = 1_000 * SECOND
-
-        def play(seconds):
-            tick = Clock()
-            tick.clock.sec, tick.clock.nanosec = divmod(start + round(seconds * SECOND), SECOND)
-            clock.publish(tick)
-            rig.send(start + round(seconds * SECOND))
-            peer.spin(0.4)
-
-        for step in range(6):
-            play(step)
-        peer.wait(lambda: rig.answers(start + 5 * SECOND), what="a pose while the clock runs")
-        assert "anew" not in node.log()
-        rig.odometry.clear()
-        for step in range(4):
-            play(step + 0.5)
-        peer.wait(lambda: rig.answers(start + round(3.5 * SECOND)), what="a pose after the jump back")
-        assert re.search(r"(went back|time went back) by .*beginning anew", node.log())
-        peer.wait(lambda: "went back" in values(peer, "estimates")["began anew"], what="the restart in the diagnostics")
-
-
-def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
-    with running(domain, tmp_path, ["image_qos=reliable"]) as (node, peer):
-        Rig(peer, reliable=False)
-        assert finding(peer, "inputs", "peer offers BEST_EFFORT, image_qos asks for RELIABLE") == 2
-        text = "offers less RELIABILITY than image_qos:=reliable asks"
-        peer.wait(lambda: text in node.log(), what="the event's line in the log")
-    with running(domain, tmp_path) as (_, peer):
-        peer.publisher(PointCloud2, "source/image")
-        peer.publisher(PointCloud2, "source/depth")
-        assert (
-            finding(peer, "inputs", "peer publishes sensor_msgs/msg/PointCloud2, expected sensor_msgs/msg/Image") == 2
-        )
-
-
-@pytest.mark.parametrize("offered", ["RELIABLE", "BEST_EFFORT"])
-def test_images_that_get_lost_are_asked_for_reliably_where_that_is_offered(domain, tmp_path, offered):
-    from sensor_msgs.msg import Image
-
-    with running(domain, tmp_path) as (_, peer):
-        images = peer.publisher(Image, "source/image", reliable=offered == "RELIABLE")
-        peer.matched(images)
-        kept = [step for step in range(120) if np.random.default_rng(step).random() < 0.4]
-        for step in kept:
-            stamp_ns = 1_700_000_000 * SECOND + step * SECOND // 30
-            images.publish(image(np.zeros((8, 8, 3), np.uint8), "rgb8", "rclpy", stamp_ns=stamp_ns))
-            peer.spin(0.03)
-        peer.wait(lambda: offered in values(peer, "inputs").get("source/image", ""), what=offered)
-        peer.spin(1.2)
-        assert offered in values(peer, "inputs")["source/image"]
-
-
-def test_missing_inputs_are_named(domain, tmp_path):
-    with running(domain, tmp_path, ["input_timeout=1.0"], ["source/depth:=/front/depth"]) as (_, peer):
-        rig = Rig(peer)
-        for camera in rig.cameras:
-            peer.matched(camera.image)
-        for _ in range(15):
-            rig.send()
-            peer.spin(0.1)
-        assert finding(peer, "inputs", "nothing received yet: source/depth (/front/depth, 0 publisher(s))") == 2
-        finding(peer, "inputs", "silent: ")
-
-
-def test_images_that_never_belong_together_are_explained(domain, tmp_path):
-    with running(domain, tmp_path, ["input_timeout=0.5"]) as (_, peer):
-        rig = Rig(peer).ready()
-        start = 1_700_000_000 * SECOND
-        for step in range(40):
-            rig.cameras[0].publish(start + step * SECOND // 10)
-            rig.cameras[1].publish(start + step * SECOND // 10 + SECOND // 20)
-            peer.spin(0.1)
-        text = "none belong together within sync_slop = 0.02 s"
-        assert any(text in message for _, message, _ in peer.diagnostics().values()), peer.diagnostics()
 
 
 RECORDING = Path(__file__).resolve().parents[2] / "shared" / "data" / "bags" / "hololens_rgbd"

@@ -8,7 +8,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from graph import ROOT, SECOND, Camera, Peer, private_domain, room_pair
+from graph import ROOT, SECOND, Camera, Peer, room_pair
 
 pytest.importorskip("rclpy")
 import rclpy
@@ -20,12 +20,6 @@ from garps_core.types import PoseEstimate, Status
 from garps_ros import solver
 from garps_ros.node import PoseNode
 from msg_adapters import header_stamp_ns
-
-
-@pytest.fixture(scope="module")
-def domain(tmp_path_factory):
-    with private_domain(tmp_path_factory.mktemp("ros")) as held:
-        yield held
 
 
 class Inside:

@@ -135,9 +135,6 @@ def test_estimator_gets_source_target_and_the_jobs_config(calls):
     np.testing.assert_allclose(result.outcomes[0].T[0, 3], 0.25)
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("source_frame", "target_frame", "expected"),
     [
@@ -208,9 +205,6 @@ def test_a_prior_that_cannot_be_used_is_left_out_with_its_reason(calls, prior, r
     result = solve(*pair(), prior=prior())
     assert re.search(reason, result.prior) and result.prior.startswith("refused: ")
     assert calls[0][3] is None and result.outcomes[0].T is not None
-
-
-# --- errors -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frames", [pair(2), (frame(2),)], ids=["pair", "followed"])
@@ -326,9 +320,6 @@ def test_stage_and_times_are_those_of_the_work(monkeypatch):
     results = [solve(frame(i), settings=KEYFRAME, by=by) for i in (1, 2, 3)]
     assert [len(r.outcomes) for r in results] == [1, 1, 2] and by.stage == ""
     assert results[0].core_s == 0 and results[1].core_s >= 0.1 and results[2].core_s >= 0.2, "all attempts together"
-
-
-# --- clouds -----------------------------------------------------------------------------------------------------------
 
 
 def off_the_surface(cloud):
