@@ -25,8 +25,13 @@ CHEAP = ["lifting.stride=4", "start.max_features=1000"]
 
 @contextmanager
 def running(domain, tmp_path, settings=(), remaps=()):
-    """A node with settings like "pairing=keyframe", and a peer; both end in good order."""
-    words = [word for setting in [*CHEAP, *settings] for word in ("-p", setting.replace("=", ":=", 1))]
+    """A node with settings like "pairing=keyframe", and a peer; both end in good order.
+
+    Its subscriptions are reliable, so that no message is lost on a loaded machine, unless a setting says otherwise.
+    """
+    words = [
+        word for setting in [*CHEAP, "image_qos=reliable", *settings] for word in ("-p", setting.replace("=", ":=", 1))
+    ]
     words += [word for remap in remaps for word in ("-r", remap)]
     with (
         NodeProcess(["--ros-args", *words], domain.environment, tmp_path / "node.log") as node,

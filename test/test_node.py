@@ -21,16 +21,16 @@ from std_srvs.srv import SetBool, Trigger
 from garps_ros.publishing import message_class
 
 TRANSPORTS = {
-    "raw_reliable": ({"depth": "16UC1", "reliable": True}, []),
-    "raw_best_effort": ({"depth": "32FC1", "reliable": False}, []),
+    "raw_offered_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=auto"]),
+    "raw_best_effort": ({"depth": "32FC1", "reliable": False}, ["image_qos=auto"]),
     "asked_for_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=reliable"]),
     "jpeg_and_compressed_depth": (
         {"colour": "jpeg", "depth": "compressedDepth"},
-        ["image_transport=compressed", "depth_transport=compressedDepth"],
+        ["image_transport=compressed", "depth_transport=compressedDepth", "image_qos=auto"],
     ),
     "png_best_effort": (
         {"colour": "png", "depth": "png", "reliable": False},
-        ["image_transport=compressed", "depth_transport=compressed"],
+        ["image_transport=compressed", "depth_transport=compressed", "image_qos=best_effort"],
     ),
 }
 

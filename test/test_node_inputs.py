@@ -59,7 +59,7 @@ def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
 def test_images_that_get_lost_are_asked_for_reliably_where_that_is_offered(domain, tmp_path, offered):
     from sensor_msgs.msg import Image
 
-    with running(domain, tmp_path) as (_, peer):
+    with running(domain, tmp_path, ["image_qos=auto"]) as (_, peer):
         images = peer.publisher(Image, "source/image", reliable=offered == "RELIABLE")
         peer.matched(images)
         kept = [step for step in range(120) if np.random.default_rng(step).random() < 0.4]
