@@ -266,7 +266,7 @@ def report_live(pairs: list[StereoPair], poses: dict[int, LivePose]) -> bool:
     if not found:
         console.print("[red]no pose came[/red]; see live.log")
         return False
-    baseline, latency = (float(value) for value in np.median(found, axis=0))
+    baseline, latency = (float(value) for value in np.nanmedian(found, axis=0))
     verdict = "[green]good[/green]" if baseline < LIMIT_MM else "[red]too much[/red]"
     if len(found) < len(pairs):
         console.print("No pose: rejected, or the machine was busy with an older pair.")

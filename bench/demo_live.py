@@ -31,7 +31,7 @@ START_S, LAST_S = 60.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class LivePose:
-    """A pose as it came: T is 4x4 (source in target); latency in seconds."""
+    """A pose as it came: T is 4x4 (source in target); latency in s, NaN where its first message was not heard."""
 
     T: npt.NDArray[Any]
     latency_s: float
