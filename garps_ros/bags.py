@@ -87,17 +87,22 @@ class Bag:
         A message that cannot be decoded comes as the MessageError that says why. When the file breaks off, the
         iteration ends and `broken_end` says why.
         """
+        for connection, _, raw in self._records(topics):
+            yield connection.topic, self._decoded(raw, connection.msgtype)
+
+    def _records(self, topics: Collection[str]) -> Iterator[tuple[Any, int, Any]]:
+        """(connection, recording time ns, raw message) of some topics, as far as the file is whole."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
-        raw_messages = self._reader.messages(connections=connections) if connections else iter(())
+        records = self._reader.messages(connections=connections) if connections else iter(())
         while True:
             try:
-                connection, _, raw = next(raw_messages)
+                record = next(records)
             except StopIteration:
                 return
             except Exception as error:  # see __enter__
                 self.broken_end = _one_line(error)
                 return
-            yield connection.topic, self._decoded(raw, connection.msgtype)
+            yield record
 
     def listing(self) -> str:
         """The topics with their types, for error texts."""

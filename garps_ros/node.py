@@ -27,9 +27,8 @@ from garps_ros.priors import Priors
 from garps_ros.publishing import Publishing
 from garps_ros.solver import Job, Result, Solver
 from garps_ros.worker import Worker
-from msg_adapters import MessageError
+from msg_adapters import NANOSECONDS, MessageError
 
-NANOSECONDS = 1_000_000_000
 OFTEN_S = 0.2
 STALE = "stale: reset or settings changed"
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False)

@@ -31,9 +31,9 @@ from garps_ros.raw_bags import RawBag
 from garps_ros.routes import CLOCK_TOPIC, Route, open_routes
 from garps_ros.session import stop_on_signals
 from garps_ros.topics import IMAGE_TYPES
+from msg_adapters import NANOSECONDS
 
 INTERRUPTED = 130
-NANOSECONDS = 1_000_000_000
 TICK_S = 0.008
 """Wall time between two /clock messages: 100 Hz, with room for a coarse timer."""
 LEAD_S = 0.1

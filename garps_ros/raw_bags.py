@@ -28,17 +28,8 @@ class RawBag(Bag):
         A ROS 1 message that cannot be rewritten comes as the MessageError that says why. When the file breaks off, the
         iteration ends and `broken_end` says why.
         """
-        connections = [connection for connection in self._reader.connections if connection.topic in topics]
-        raw_messages = self._reader.messages(connections=connections) if connections else iter(())
         to_cdr = bytes_of if self._reader.is2 else self._rewriter()
-        while True:
-            try:
-                connection, recorded_ns, raw = next(raw_messages)
-            except StopIteration:
-                return
-            except Exception as error:  # a damaged file makes the reader and its decoders raise nearly anything
-                self.broken_end = " ".join(str(error).split())[:200] or type(error).__name__
-                return
+        for connection, recorded_ns, raw in self._records(topics):
             yield connection.topic, recorded_ns, to_cdr(raw, connection.msgtype)
 
     @property
@@ -68,7 +59,7 @@ class RawBag(Bag):
         def rewritten(raw: Any, kind: str) -> bytes | MessageError:
             try:
                 return bytes(store.ros1_to_cdr(raw, kind))
-            except Exception as error:  # see raw_messages
+            except Exception as error:  # a damaged message makes the decoders raise nearly anything
                 return MessageError(f"message cannot be rewritten as {kind}: {' '.join(str(error).split())[:200]}")
 
         return rewritten

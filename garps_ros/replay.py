@@ -30,10 +30,10 @@ from garps_ros.session import record, stop_on_signals
 from garps_ros.summary import Summary
 from garps_ros.topics import choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
+from msg_adapters import NANOSECONDS
 
 NAME = "garps-replay"
 INTERRUPTED = 130
-NANOSECONDS = 1_000_000_000
 ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
 ONE_OF_RECTIFIED = ("auto", "true", "false")
 GIVEN = "COMMANDLINE"

@@ -4,11 +4,12 @@
 from msg_adapters.cameras import Camera, camera_from_info
 from msg_adapters.clouds import CloudWriter
 from msg_adapters.errors import MessageError
-from msg_adapters.fields import header_frame_id, header_stamp_ns, ns_to_stamp, stamp_to_ns
+from msg_adapters.fields import NANOSECONDS, header_frame_id, header_stamp_ns, ns_to_stamp, stamp_to_ns
 from msg_adapters.images import depth_image, is_compressed, rgb_image
 from msg_adapters.poses import PoseWriter, checked_covariance, pose_from_message
 
 __all__ = [
+    "NANOSECONDS",
     "Camera",
     "CloudWriter",
     "MessageError",

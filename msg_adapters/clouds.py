@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters.errors import MessageError
-from msg_adapters.fields import ns_to_stamp
+from msg_adapters.fields import make_header
 
 MAX_POINTS = 2_000_000
 """32 MB, every pixel of a 1600x1200 image; a viewer needs far fewer."""
@@ -53,7 +53,7 @@ class CloudWriter:
         data.frombytes(packed.tobytes())  # anything but an array("B") is walked byte by byte by the checks of rclpy
         return self._make(
             "sensor_msgs/msg/PointCloud2",
-            header=self._header(stamp_ns, frame_id),
+            header=make_header(self._class, stamp_ns, frame_id),
             height=1,
             width=len(packed),
             fields=[self._field(name, offset) for name, offset in OFFSETS.items()],
@@ -69,13 +69,6 @@ class CloudWriter:
 
     def _field(self, name: str, offset: int) -> Any:
         return self._make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=FLOAT32, count=1)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        if not isinstance(frame_id, str) or not frame_id:
-            raise MessageError(f"frame_id is {frame_id!r}: expected the name of a frame")
-        sec, nanosec = ns_to_stamp(stamp_ns)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=int(sec), nanosec=int(nanosec))
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=str(frame_id))
 
 
 def _packed(points: npt.ArrayLike, colours: npt.ArrayLike) -> npt.NDArray[np.void]:

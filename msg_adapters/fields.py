@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,20 @@ def header_stamp_ns(message: Any) -> int:
 def header_frame_id(message: Any) -> str:
     """Name of the frame from the header; may be empty. Raises MessageError if it is no text."""
     return text(field(message, "header"), "frame_id")
+
+
+def make_header(message_class: Callable[[str], Callable[..., Any]], stamp_ns: int, frame_id: str) -> Any:
+    """A std_msgs/Header of a message library. Raises MessageError on a stamp that is no time, or no frame."""
+    sec, nanosec = ns_to_stamp(stamp_ns)
+    stamp = message_class("builtin_interfaces/msg/Time")(sec=int(sec), nanosec=int(nanosec))
+    return message_class("std_msgs/msg/Header")(stamp=stamp, frame_id=checked_name("frame_id", frame_id))
+
+
+def checked_name(name: str, value: str) -> str:
+    """The name of a frame. Raises MessageError if it is empty or no text."""
+    if not isinstance(value, str) or not value:
+        raise MessageError(f"{name} is {value!r}: expected the name of a frame")
+    return str(value)
 
 
 def _kind(message: Any) -> str:

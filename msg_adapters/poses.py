@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters.errors import MessageError
-from msg_adapters.fields import field, ns_to_stamp, numbers
+from msg_adapters.fields import checked_name, field, make_header, numbers
 from msg_adapters.rotations import matrix_from_quaternion, quaternion_from_matrix
 
 Float64Array = npt.NDArray[np.float64]
@@ -43,7 +43,9 @@ class PoseWriter:
 
     def pose_stamped(self, T: npt.ArrayLike, stamp_ns: int, frame_id: str) -> Any:
         """A PoseStamped of the 4x4 motion T_target_source. Raises MessageError on a value that cannot be sent."""
-        return self._make("geometry_msgs/msg/PoseStamped", header=self._header(stamp_ns, frame_id), pose=self._pose(T))
+        return self._make(
+            "geometry_msgs/msg/PoseStamped", header=make_header(self._class, stamp_ns, frame_id), pose=self._pose(T)
+        )
 
     def pose_with_covariance_stamped(
         self, T: npt.ArrayLike, covariance: npt.ArrayLike, stamp_ns: int, frame_id: str
@@ -51,7 +53,7 @@ class PoseWriter:
         """A PoseWithCovarianceStamped of T_target_source and its 6x6. Raises MessageError as `checked_covariance`."""
         return self._make(
             "geometry_msgs/msg/PoseWithCovarianceStamped",
-            header=self._header(stamp_ns, frame_id),
+            header=make_header(self._class, stamp_ns, frame_id),
             pose=self._pose_with_covariance(T, covariance),
         )
 
@@ -62,8 +64,8 @@ class PoseWriter:
         nothing = self._make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         return self._make(
             "nav_msgs/msg/Odometry",
-            header=self._header(stamp_ns, frame_id),
-            child_frame_id=_checked_name("child_frame_id", child_frame_id),
+            header=make_header(self._class, stamp_ns, frame_id),
+            child_frame_id=checked_name("child_frame_id", child_frame_id),
             pose=self._pose_with_covariance(T, covariance),
             twist=self._make(
                 "geometry_msgs/msg/TwistWithCovariance",
@@ -78,8 +80,8 @@ class PoseWriter:
         at = {axis: getattr(pose.position, axis) for axis in "xyz"}
         return self._make(
             "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp_ns, frame_id),
-            child_frame_id=_checked_name("child_frame_id", child_frame_id),
+            header=make_header(self._class, stamp_ns, frame_id),
+            child_frame_id=checked_name("child_frame_id", child_frame_id),
             transform=self._make(
                 "geometry_msgs/msg/Transform",
                 translation=self._make("geometry_msgs/msg/Vector3", **at),
@@ -89,11 +91,6 @@ class PoseWriter:
 
     def _make(self, name: str, **fields: Any) -> Any:
         return self._class(name)(**fields)
-
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        sec, nanosec = ns_to_stamp(stamp_ns)
-        stamp = self._make("builtin_interfaces/msg/Time", sec=int(sec), nanosec=int(nanosec))
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=_checked_name("frame_id", frame_id))
 
     def _pose(self, T: npt.ArrayLike) -> Any:
         motion = _checked_motion(T)
@@ -177,9 +174,3 @@ def _components(pose: Any, part: str, names: str) -> Float64Array:
     if not np.isfinite(array).all():
         raise MessageError(f"{part} is {array.tolist()}: expected finite numbers")
     return array
-
-
-def _checked_name(name: str, value: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise MessageError(f"{name} is {value!r}: expected the name of a frame")
-    return str(value)
