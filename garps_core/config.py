@@ -130,6 +130,9 @@ class Rung(Checked):
     components: int = setting(4000, "components used per view", low=50, high=1_000_000)
     neighbours: int = setting(10, "nearest neighbours per component", low=1, high=200)
     steps: int = setting(5, "solver steps at most", low=1, high=100_000)
+    blur_m: float = setting(
+        0.0, "sigma of an isotropic blur of a pair of components, so that far surfaces pull", unit="m", low=0, high=100
+    )
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from garps_core import compiled
 from garps_core.geometry import Array, skew
 
 CHUNK_PAIRS = 1 << 15
@@ -80,7 +81,7 @@ def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
     mu, S = _moved(pairs, T)
     sums = _row_sums(pairs, mu, S)
-    weights, s = pairs.weights.double(), sums[0]
+    weights, s = pairs.weights.double(), sums[0].double()
     if form == "log":
         value = float((weights * torch.log1p(s)).sum())
         c = weights / (1 + s)
@@ -94,6 +95,7 @@ def row_information(pairs: Pairs, T: Array) -> tuple[Array, Array]:
     """What each row of the "log" objective measures: (n, 3, 3) sum of r_ij S^-1 times its weight, and (n, 3) mu'."""
     mu, S = _moved(pairs, T)
     sums = _row_sums(pairs, mu, S)
+    sums = sums.double()
     Q = sums[4:10] * (pairs.weights.double() / (1 + sums[0]))
     return unpack(Q.T).cpu().numpy(), mu.T.double().cpu().numpy()
 
@@ -116,11 +118,19 @@ def _packed_rotation(R: Array) -> Array:
 
 
 def _row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
-    """(16, n) float64 sums over each row's partners: g, g u (3), g S^-1 (6), g u u' (6), in units of the floor."""
+    """(16, n) sums over each row's partners: g, g u (3), g S^-1 (6), g u u' (6), in units of the floor."""
+    if on_compiled_path(mu):
+        parts = (mu, S, pairs.partner_means, pairs.partner_covariances, pairs.log_weights, pairs.log_floor)
+        return torch.from_numpy(compiled.row_sums(*(part.contiguous().numpy() for part in parts)))
     n, k = len(pairs.means), pairs.log_weights.shape[0]
     chunk = max(1, (CHUNK_PAIRS_CUDA if mu.is_cuda else CHUNK_PAIRS) // max(k, 1))
     parts = [_chunk_sums(pairs, mu, S, slice(begin, begin + chunk)) for begin in range(0, n, chunk)]
-    return torch.cat(parts, dim=1).double()
+    return torch.cat(parts, dim=1)
+
+
+def on_compiled_path(like: Tensor) -> bool:
+    """True where `compiled` can do the arithmetic: numba is there, and the numbers are float32 on a CPU."""
+    return compiled.AVAILABLE and like.device.type == "cpu" and like.dtype == torch.float32
 
 
 def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
@@ -166,18 +176,24 @@ def _combine(c: Tensor, sums: Tensor, mu: Tensor, S: Tensor, weights: Tensor | N
 
     J' Q J is quadratic in mu', so it needs only the moments sum Q, sum mu' Q and sum mu' mu'' Q: two small products.
     """
-    mu, scaled = mu.double(), sums[1:] * c
+    per_weight = torch.zeros_like(c) if weights is None else 1 / weights.clamp_min(1e-300)
+    if on_compiled_path(mu):
+        moments, turning = compiled.moments(*(part.numpy() for part in (c, per_weight, sums, mu, S)))
+    else:
+        moments, turning = _moments(c, per_weight, sums, mu, S)
+    information = _through_jacobian(moments[:, 3:9])
+    return _gradient(moments[:4, :3], turning), information, information - _through_jacobian(moments[:, 9:])
+
+
+def _moments(c: Tensor, per_weight: Tensor, sums: Tensor, mu: Tensor, S: Tensor) -> tuple[Array, Array]:
+    """(10, 15) sums of (1, mu', mu' mu'') times (u, S^-1, missing), and (6, 6) of S' times (u u' - S^-1)."""
+    mu, scaled = mu.double(), sums[1:].double() * c
     U, Q, A = scaled[:3], scaled[3:9], scaled[9:]
-    missing = A
-    if weights is not None:
-        per_weight = 1 / weights.clamp_min(1e-300)
-        missing = A - torch.stack([U[i] * U[j] * per_weight for i, j in SYMMETRIC])
+    missing = A - torch.stack([U[i] * U[j] * per_weight for i, j in SYMMETRIC])
     ones = torch.ones_like(mu[:1])
     powers = torch.cat([ones, mu, torch.stack([mu[i] * mu[j] for i, j in SYMMETRIC])])
     moments = (powers @ torch.cat([U, Q, missing]).T).cpu().numpy()
-    turning = (S.double() @ (A - Q).T).cpu().numpy()  # sum over rows of S'_ab (u u' - S^-1)_cd
-    information = _through_jacobian(moments[:, 3:9])
-    return _gradient(moments[:4, :3], turning), information, information - _through_jacobian(moments[:, 9:])
+    return moments, (S.double() @ (A - Q).T).cpu().numpy()
 
 
 def _gradient(moments: Array, turning: Array) -> Array:

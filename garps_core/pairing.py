@@ -10,11 +10,15 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from garps_core import compiled
 from garps_core.config import Alignment, Config, Rung
 from garps_core.errors import ConfigError
 from garps_core.geometry import Array, se3_inverse
-from garps_core.objective import Pairs, pack
+from garps_core.objective import Pairs, on_compiled_path, pack
 from garps_core.types import Frustum, Mixture
+
+NEAREST_Z_M = 1e-3
+"""Image coordinates of points nearer than this, or behind the camera, are taken at this range."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,9 @@ def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: floa
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
     K = torch.as_tensor(other.K, dtype=like.dtype, device=like.device)
     depth = torch.as_tensor(other.depth, dtype=like.dtype, device=like.device)
+    if on_compiled_path(like):
+        mask = compiled.seen(*(part.contiguous().numpy() for part in (like, R, t, K, depth)), occlusion_ratio)
+        return torch.from_numpy(mask)
     height, width = depth.shape
     p = like @ R.T + t
     z = p[:, 2].clamp_min(1e-6)
@@ -101,25 +108,50 @@ def overlap(source: Cloud, target: Cloud, T: Array, settings: Alignment) -> floa
 
 
 def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignment) -> Pairs:
-    """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances scaled by the rung."""
+    """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances widened by the rung."""
     index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)), settings.depth_weight)
-    chosen = index.T.contiguous()  # (k, n)
-    log_weights = torch.log(partners.weights.clamp_min(1e-30))[chosen]
-    log_weights = log_weights - _colour_cost(rows, partners, chosen, settings.colour_variance)
+    means, covariances, log_weights = _gathered(rows, partners, index, rung, settings)
     if rows.labels is not None and partners.labels is not None:
-        differs = (rows.labels[None] != partners.labels[chosen]).to(log_weights.dtype)
+        differs = (rows.labels[None] != partners.labels[index.T]).to(log_weights.dtype)
         log_weights = log_weights + differs * float(np.log(max(settings.semantic_discount, 1e-30)))
-    log_weights = log_weights.masked_fill(settings.max_distance_m < distance.T, -torch.inf)
-    scale = rung.covariance_scale
-    covariances = rows.covariances * scale
+    own = widened(rows.covariances, rung)
     return Pairs(
         rows.means,
-        covariances,
+        own,
         rows.weights / rows.weights.sum(),
-        _log_floor(covariances, partners, settings.outlier_floor),
+        _log_floor(own, partners, settings.outlier_floor),
+        means,
+        covariances,
+        log_weights.masked_fill(settings.max_distance_m < distance.T, -torch.inf),
+    )
+
+
+def widened(covariances: Tensor, rung: Rung) -> Tensor:
+    """Packed covariances (n, 6) as a rung sees them: scaled, and blurred by half of `blur_m` squared in all directions."""
+    wider = covariances * rung.covariance_scale
+    wider[:, [0, 3, 5]] += 0.5 * rung.blur_m**2
+    return wider
+
+
+def _gathered(
+    rows: Cloud, partners: Cloud, index: Tensor, rung: Rung, settings: Alignment
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each row's partners, index (n, k): means (3, k, n), covariances (6, k, n), log weights (k, n).
+
+    Colours cost half their squared Mahalanobis distance, each with `colour_variance` per channel.
+    """
+    covariances = widened(partners.covariances, rung)
+    log_weights, per_colour = torch.log(partners.weights.clamp_min(1e-30)), 0.25 / settings.colour_variance
+    if on_compiled_path(rows.means):
+        parts = (index, partners.means, covariances, log_weights, partners.colours, rows.colours)
+        found = compiled.gathered(*(part.contiguous().numpy() for part in parts), per_colour)
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2])
+    chosen = index.T.contiguous()
+    cost = sum((rows.colours[:, c][None] - partners.colours[:, c][chosen]) ** 2 for c in range(3))
+    return (
         partners.means.T[:, chosen].contiguous(),
-        (partners.covariances.T * scale)[:, chosen].contiguous(),
-        log_weights,
+        covariances.T[:, chosen].contiguous(),
+        log_weights[chosen] - per_colour * cost,
     )
 
 
@@ -129,8 +161,11 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
     moved = like @ R.T + t
     them = partners.means
+    if on_compiled_path(like) and len(them) and float(them[:, 2].min()) > NEAREST_Z_M:
+        index, distance = compiled.nearest(moved.numpy(), them.contiguous().numpy(), k, depth_weight)
+        return torch.from_numpy(index), torch.from_numpy(distance)
     if depth_weight < 1:
-        moved, them = _image_coordinates(moved, depth_weight), _image_coordinates(them, depth_weight)
+        moved, them = image_coordinates(moved, depth_weight), image_coordinates(them, depth_weight)
     if like.is_cuda:
         found = [torch.cdist(block, them).topk(k, largest=False) for block in torch.split(moved, 4096)]
         return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
@@ -141,18 +176,10 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     return torch.from_numpy(index.reshape(shape)), torch.from_numpy(distance.reshape(shape)).to(like.dtype)
 
 
-def _image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
+def image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
     """(n, 3) m -> (x/z, y/z, depth_weight log z): a partner along the same ray is near although its depth is off."""
-    z = points[:, 2:].clamp_min(1e-3)
+    z = points[:, 2:].clamp_min(NEAREST_Z_M)
     return torch.cat([points[:, :2] / z, depth_weight * torch.log(z)], dim=1)
-
-
-def _colour_cost(rows: Cloud, partners: Cloud, chosen: Tensor, variance: float) -> Tensor:
-    """Half the squared Mahalanobis distance (k, n) of the colours, both with `variance` per channel."""
-    cost = torch.zeros(chosen.shape, dtype=rows.means.dtype, device=rows.means.device)
-    for channel in range(3):
-        cost += (rows.colours[:, channel][None] - partners.colours[:, channel][chosen]) ** 2
-    return cost.mul_(0.25 / variance)
 
 
 def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:

@@ -10,6 +10,7 @@ pose. Lambda_0 is the inverse covariance of the initial pose, converted to the l
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,8 @@ from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, s
 from garps_core.objective import Evaluation, Pairs, evaluate, unpack
 from garps_core.pairing import Cloud, pair_up, thin, visible
 
+_SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
+"""Compiled loops release the interpreter: target to source is computed beside source to target."""
 MIN_ROWS = 50
 SMALLEST_CURVATURE = 0.1
 """Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
@@ -56,8 +59,9 @@ class Solution:
 
 def two_way(forward: Pairs, backward: Pairs, T: Array) -> Evaluation:
     """Mean of the "log" objective of source rows moved by T and of target rows moved by T^-1, over T's left twist."""
+    other = _SECOND_DIRECTION.submit(evaluate, backward, se3_inverse(T), "log")
     f = evaluate(forward, T, "log")
-    b = evaluate(backward, se3_inverse(T), "log")
+    b = other.result()
     A = -adjoint(se3_inverse(T))  # (exp(x) T)^-1 = exp(-Ad(T^-1) x) T^-1
     return Evaluation(
         0.5 * (f.value + b.value),
@@ -167,7 +171,8 @@ def rung_pairs(
     y_rows = thin(y_seen, int(np.ceil(len(y_seen) * min(1.0, rung.components / len(y)))))
     if min(len(x_rows), len(y_rows)) < MIN_ROWS:
         return None
-    return pair_up(x_rows, y_seen, T, rung, settings), pair_up(y_rows, x_seen, back, rung, settings)
+    other = _SECOND_DIRECTION.submit(pair_up, y_rows, x_seen, back, rung, settings)
+    return pair_up(x_rows, y_seen, T, rung, settings), other.result()
 
 
 def _at_resolution(cloud: Cloud, rung: Rung, density: float) -> Cloud:

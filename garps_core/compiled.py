@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same arithmetic as `objective.py` and `pairing.py` in compiled loops, used on a CPU when numba is installed.
+
+Nothing here decides anything: every function has a torch or SciPy counterpart beside its caller, which runs without
+numba, on CUDA and in float64, and gives the same numbers to 1e-5 (`test/test_compiled.py`). Loops release the
+interpreter, so that both directions of an alignment run at once. numba keeps the machine code beside this file, or in
+the user's cache, so only the very first call waits for the compiler.
+
+How they are fast: one flat scratch array with constant offsets in the pair loop lets the compiler see that nothing
+overlaps, so it works on 8 or 16 rows at a time; the exponential is a polynomial it can do the same with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
+Loop = TypeVar("Loop", bound=Callable[..., Any])
+
+try:
+    import numba
+except ImportError:  # optional: pip install garps[fast]
+    numba = None
+
+AVAILABLE = numba is not None
+ROWS = 128
+"""Rows handled at a time: the scratch of 36 planes stays in a core's first-level cache."""
+FINITE_MATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
+"""Liberties the compiler may take; not the one that forgets infinities, which mean "no partner"."""
+PER_CELL = 2.0
+"""Partners in a cell of the neighbour search's image grid, on average."""
+
+
+def _loop(function: Loop) -> Loop:
+    if numba is None:
+        return function
+    options: dict[str, Any] = {"nogil": True, "fastmath": FINITE_MATH, "error_model": "numpy"}
+    try:
+        compiled = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder to keep machine code in: compile in every process
+        compiled = numba.njit(**options)(function)
+    return compiled  # type: ignore[no-any-return]
+
+
+@_loop
+def _exp(x: np.float32) -> np.float32:
+    """e^x for -80 < x < 80, relative error 2e-7: 2^n times a polynomial (Cephes expf)."""
+    n = np.int32(np.int32(x * np.float32(1.44269504) + np.float32(256.5)) - np.int32(256))
+    whole = np.float32(n)
+    r = x - whole * np.float32(0.693359375) + whole * np.float32(2.12194440e-4)
+    p = np.float32(1.9875691500e-4)
+    p = p * r + np.float32(1.3981999507e-3)
+    p = p * r + np.float32(8.3334519073e-3)
+    p = p * r + np.float32(4.1665795894e-2)
+    p = p * r + np.float32(1.6666665459e-1)
+    p = p * r + np.float32(5.0000001201e-1)
+    p = p * r * r + r + np.float32(1)
+    return p * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)  # type: ignore[no-any-return]
+
+
+@_loop
+def row_sums(
+    mu: Float32, S: Float32, partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32
+) -> Float32:
+    """(16, n) sums of `objective._row_sums`: mu (3, n), S (6, n), (3, k, n), (6, k, n), (k, n), (n,)."""
+    k, n = log_weights.shape
+    out = np.empty((16, n), np.float32)
+    w = np.empty(20 * ROWS, np.float32)  # planes: 0 mu, 3 S, 9 floor, 10 d, 13 S + S_j, 19 logarithm of the weight
+    total = np.empty(16 * ROWS, np.float32)
+    for begin in range(0, n, ROWS):
+        rows = min(ROWS, n - begin)
+        for plane in range(3):
+            for r in range(rows):
+                w[plane * ROWS + r] = mu[plane, begin + r]
+        for plane in range(6):
+            for r in range(rows):
+                w[(3 + plane) * ROWS + r] = S[plane, begin + r]
+        for r in range(rows):
+            w[9 * ROWS + r] = floor[begin + r]
+        total[:] = 0
+        for j in range(k):
+            for plane in range(3):
+                from_plane = partners[plane, j]
+                for r in range(rows):
+                    w[(10 + plane) * ROWS + r] = w[plane * ROWS + r] - from_plane[begin + r]
+            for plane in range(6):
+                from_plane = covariances[plane, j]
+                for r in range(rows):
+                    w[(13 + plane) * ROWS + r] = w[(3 + plane) * ROWS + r] + from_plane[begin + r]
+            weights = log_weights[j]
+            for r in range(rows):
+                w[19 * ROWS + r] = weights[begin + r] - w[9 * ROWS + r]
+            _add_partner(w, total, rows)
+        for plane in range(16):
+            for r in range(rows):
+                out[plane, begin + r] = total[plane * ROWS + r]
+    return out
+
+
+@_loop
+def _add_partner(w: Float32, total: Float32, rows: int) -> None:
+    """Add one partner of each row to the sums; the formulas of `objective._chunk_sums`, in its order."""
+    one, left = np.float32(1), np.float32(1.1920929e-07)
+    for r in range(rows):
+        d0, d1, d2 = w[10 * ROWS + r], w[11 * ROWS + r], w[12 * ROWS + r]
+        a, b, c = w[13 * ROWS + r], w[14 * ROWS + r], w[15 * ROWS + r]
+        e, f, i = w[16 * ROWS + r], w[17 * ROWS + r], w[18 * ROWS + r]
+        r0 = one / a
+        l1, l2 = b * r0, c * r0
+        second = max(e - b * l1, e * left)
+        r1 = one / second
+        f = f - c * l1
+        l3 = f * r1
+        third = max(i - c * l2 - f * l3, i * left)
+        p5 = one / third
+        m = l1 * l3 - l2
+        p4, p2 = -l3 * p5, m * p5
+        l1r = l1 * r1
+        p1 = m * p4 - l1r
+        p0 = r0 + l1 * l1r + m * p2
+        p3 = r1 - l3 * p4
+        u0 = p0 * d0 + p1 * d1 + p2 * d2
+        u1 = p1 * d0 + p3 * d1 + p4 * d2
+        u2 = p2 * d0 + p4 * d1 + p5 * d2
+        D = d0 * u0 + d1 * u1 + d2 * u2
+        exponent = min(max(w[19 * ROWS + r] - np.float32(0.5) * D, np.float32(-60)), np.float32(80))
+        g = _exp(exponent) / (np.sqrt(a) * np.sqrt(second) * np.sqrt(third))
+        g0, g1, g2 = g * u0, g * u1, g * u2
+        total[r] += g
+        total[ROWS + r] += g0
+        total[2 * ROWS + r] += g1
+        total[3 * ROWS + r] += g2
+        total[4 * ROWS + r] += p0 * g
+        total[5 * ROWS + r] += p1 * g
+        total[6 * ROWS + r] += p2 * g
+        total[7 * ROWS + r] += p3 * g
+        total[8 * ROWS + r] += p4 * g
+        total[9 * ROWS + r] += p5 * g
+        total[10 * ROWS + r] += g0 * u0
+        total[11 * ROWS + r] += g0 * u1
+        total[12 * ROWS + r] += g0 * u2
+        total[13 * ROWS + r] += g1 * u1
+        total[14 * ROWS + r] += g1 * u2
+        total[15 * ROWS + r] += g2 * u2
+
+
+@_loop
+def moments(c: Float64, missing: Float64, sums: Float32, mu: Float32, S: Float32) -> tuple[Float64, Float64]:
+    """(10, 15) moments and (6, 6) turning of `objective._combine`.
+
+    c (n,) multiplies the sums; missing (n,) multiplies the outer product of a row's own u, 0 for the "sum" form.
+    """
+    n = len(c)
+    out, turning = np.zeros((10, 15)), np.zeros((6, 6))
+    w = np.empty(31 * ROWS)  # planes: 0 powers of mu, 10 u, 13 S^-1, 19 what is missing, 25 S
+    for begin in range(0, n, ROWS):
+        rows = min(ROWS, n - begin)
+        for r in range(rows):
+            x, y, z = np.float64(mu[0, begin + r]), np.float64(mu[1, begin + r]), np.float64(mu[2, begin + r])
+            w[r], w[ROWS + r], w[2 * ROWS + r], w[3 * ROWS + r] = 1.0, x, y, z
+            w[4 * ROWS + r], w[5 * ROWS + r], w[6 * ROWS + r] = x * x, x * y, x * z
+            w[7 * ROWS + r], w[8 * ROWS + r], w[9 * ROWS + r] = y * y, y * z, z * z
+        for plane in range(15):
+            for r in range(rows):
+                w[(10 + plane) * ROWS + r] = sums[1 + plane, begin + r] * c[begin + r]
+        for plane in range(6):
+            for r in range(rows):
+                w[(25 + plane) * ROWS + r] = S[plane, begin + r]
+        for a in range(6):
+            for b in range(6):
+                s = 0.0
+                for r in range(rows):
+                    s += w[(25 + a) * ROWS + r] * (w[(19 + b) * ROWS + r] - w[(13 + b) * ROWS + r])
+                turning[a, b] += s
+        for r in range(rows):
+            u0, u1, u2, q = w[10 * ROWS + r], w[11 * ROWS + r], w[12 * ROWS + r], missing[begin + r]
+            w[19 * ROWS + r] -= q * u0 * u0
+            w[20 * ROWS + r] -= q * u0 * u1
+            w[21 * ROWS + r] -= q * u0 * u2
+            w[22 * ROWS + r] -= q * u1 * u1
+            w[23 * ROWS + r] -= q * u1 * u2
+            w[24 * ROWS + r] -= q * u2 * u2
+        for a in range(10):
+            for b in range(15):
+                s = 0.0
+                for r in range(rows):
+                    s += w[a * ROWS + r] * w[(10 + b) * ROWS + r]
+                out[a, b] += s
+    return out, turning
+
+
+@_loop
+def gathered(
+    index: Int64, means: Float32, covariances: Float32, log_weights: Float32, colours: Float32, row_colours: Float32,
+    per_colour: float,
+) -> tuple[Float32, Float32, Float32]:  # fmt: skip
+    """Partners' means (3, k, n), covariances (6, k, n) and log weights less colour cost (k, n); index (n, k)."""
+    n, k = index.shape
+    y, S = np.empty((3, k, n), np.float32), np.empty((6, k, n), np.float32)
+    weights = np.empty((k, n), np.float32)
+    cost = np.float32(per_colour)
+    for i in range(n):
+        for j in range(k):
+            p = index[i, j]
+            for axis in range(3):
+                y[axis, j, i] = means[p, axis]
+            for element in range(6):
+                S[element, j, i] = covariances[p, element]
+            red = row_colours[i, 0] - colours[p, 0]
+            green = row_colours[i, 1] - colours[p, 1]
+            blue = row_colours[i, 2] - colours[p, 2]
+            weights[j, i] = log_weights[p] - cost * (red * red + green * green + blue * blue)
+    return y, S, weights
+
+
+@_loop
+def seen(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ratio: float) -> npt.NDArray[np.bool_]:
+    """Mask (n,) of points (n, 3) that the other camera sees (`pairing.visible`)."""
+    height, width = depth.shape
+    mask = np.zeros(len(points), np.bool_)
+    reach = np.float32(1 + ratio)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        forward = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        if forward > np.float32(1e-3):
+            u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / forward * K[0, 0] + K[0, 2]
+            v = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / forward * K[1, 1] + K[1, 2]
+            if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
+                mask[i] = not (forward > depth[int(np.rint(v)), int(np.rint(u))] * reach)
+    return mask
+
+
+@_loop
+def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tuple[Int64, Float32]:
+    """The k nearest partners of each row, exact: indices (n, k) by distance, and distances (n, k).
+
+    rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Distances in metres, or in
+    `pairing.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
+    around a row's pixel are searched until no unseen cell can hold a nearer one: whatever lies beyond a line x = a z
+    of the image is at least |x - a z| / sqrt(1 + a^2) away.
+    """
+    n, m, in_image = len(rows), len(partners), depth_weight < 1
+    slopes = np.empty((m, 2), np.float32)
+    for i in range(m):
+        for axis in range(2):
+            slopes[i, axis] = partners[i, axis] / partners[i, 2]
+    low_x, low_y = slopes[:, 0].min(), slopes[:, 1].min()
+    span_x, span_y = slopes[:, 0].max() - low_x + 1e-6, slopes[:, 1].max() - low_y + 1e-6
+    cell = np.sqrt(span_x * span_y * PER_CELL / m)
+    cell = max(cell, span_x / 1024, span_y / 1024)
+    across, down = int(span_x / cell) + 1, int(span_y / cell) + 1
+    first, order = _sorted_into_cells(slopes, low_x, low_y, cell, across, down)
+    points = np.empty((m, 3), np.float32)
+    for i in range(m):
+        p = partners[order[i]]
+        if in_image:
+            points[i, 0], points[i, 1] = p[0] / p[2], p[1] / p[2]
+            points[i, 2] = depth_weight * np.log(p[2])
+        else:
+            points[i, 0], points[i, 1], points[i, 2] = p[0], p[1], p[2]
+    index, distance = np.empty((n, k), np.int64), np.empty((n, k), np.float32)
+    best, where = np.empty(k, np.float32), np.empty(k, np.int64)
+    for i in range(n):
+        x, y, z = rows[i, 0], rows[i, 1], rows[i, 2]
+        safe = max(z, np.float32(1e-3))
+        sx, sy = x / safe, y / safe
+        q0, q1, q2 = x, y, z
+        if in_image:
+            q0, q1, q2 = sx, sy, np.float32(depth_weight * np.log(safe))
+        column = min(max(int((sx - low_x) / cell), 0), across - 1)
+        row = min(max(int((sy - low_y) / cell), 0), down - 1)
+        best[:] = np.inf
+        where[:] = 0
+        ring = 0
+        while True:
+            for v in range(max(row - ring, 0), min(row + ring, down - 1) + 1):
+                step = 1 if abs(v - row) == ring else max(2 * ring, 1)
+                for u in range(column - ring, column + ring + 1, step):
+                    if u < 0 or u >= across:
+                        continue
+                    for p in range(first[v * across + u], first[v * across + u + 1]):
+                        d0, d1, d2 = points[p, 0] - q0, points[p, 1] - q1, points[p, 2] - q2
+                        d = d0 * d0 + d1 * d1 + d2 * d2
+                        if d < best[k - 1]:
+                            place = k - 1
+                            while place > 0 and best[place - 1] > d:
+                                best[place], where[place] = best[place - 1], where[place - 1]
+                                place -= 1
+                            best[place], where[place] = d, p
+            left, right = low_x + (column - ring) * cell, low_x + (column + ring + 1) * cell
+            top, bottom = low_y + (row - ring) * cell, low_y + (row + ring + 1) * cell
+            bound = np.inf
+            if column - ring > 0:
+                bound = min(bound, _beyond(sx - left, left, z, in_image))
+            if column + ring + 1 < across:
+                bound = min(bound, _beyond(right - sx, right, z, in_image))
+            if row - ring > 0:
+                bound = min(bound, _beyond(sy - top, top, z, in_image))
+            if row + ring + 1 < down:
+                bound = min(bound, _beyond(bottom - sy, bottom, z, in_image))
+            if bound == np.inf or bound * bound > best[k - 1]:
+                break
+            ring += 1
+        for j in range(k):
+            index[i, j], distance[i, j] = order[where[j]], np.sqrt(best[j])
+    return index, distance
+
+
+@_loop
+def _beyond(gap: float, line: float, z: float, in_image: bool) -> float:
+    """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when nothing is known."""
+    if gap <= 0 or z <= 1e-3:
+        return 0.0
+    return gap if in_image else gap * z / np.sqrt(1 + line * line)
+
+
+@_loop
+def _sorted_into_cells(
+    slopes: Float32, low_x: float, low_y: float, cell: float, across: int, down: int
+) -> tuple[Int64, Int64]:
+    """First position of every cell (cells + 1,), and the partners in order of their cells (m,)."""
+    m = len(slopes)
+    of, first = np.empty(m, np.int64), np.zeros(across * down + 1, np.int64)
+    for i in range(m):
+        u = min(int((slopes[i, 0] - low_x) / cell), across - 1)
+        v = min(int((slopes[i, 1] - low_y) / cell), down - 1)
+        of[i] = v * across + u
+        first[of[i] + 1] += 1
+    for i in range(across * down):
+        first[i + 1] += first[i]
+    place, order = first.copy(), np.empty(m, np.int64)
+    for i in range(m):
+        order[place[of[i]]] = i
+        place[of[i]] += 1
+    return first, order
