@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The preset "paper" is the published method: its numbers, its objective and every step of its optimiser.
 
-The reference is written from the paper's eq. 5 and section 3.2 with automatic differentiation and torch's Adam; it
-shares no code with the package.
+The reference, `bench.autograd`, is written from the paper's eq. 5 with automatic differentiation and torch's Adam, its
+candidate pairs here from section 3.2; it shares no code with the package.
 """
 
 from dataclasses import replace
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 from surfaces import FREE, random_pose
-from torch.optim import Adam
 
+from bench.autograd import PlainObjective, rotation
 from garps_core import Config, Mixture, Prior, Status, align_mixtures, paper
 from garps_core.geometry import se3_inverse, transform
 from garps_core.pairing import to_cloud
@@ -36,18 +36,6 @@ def opaque_mixture(seed, count=4500):
 
 
 SOURCE, TARGET = opaque_mixture(1), opaque_mixture(2)
-
-
-def rotation(q):
-    """Quaternion (w, x, y, z) of any length -> 3x3, differentiable."""
-    w, x, y, z = q / q.norm()
-    return torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
 
 
 def quaternion(R):
@@ -77,7 +65,7 @@ class Published:
         colour = ((c_x[i] - c_y[j]) ** 2 / (0.4 + 0.4)).sum(1)
         weight = np.where(l_x[i] == l_y[j], 1, 0.92) * phi_x[i] * phi_y[j] * np.exp(-0.5 * colour)
         parts = (mu_x[i], 90 * S_x[i], mu_y[j], 90 * S_y[j], weight)
-        self.mu, self.S, self.mu_y, self.S_y, self.weight = (torch.tensor(part) for part in parts)
+        self.objective = PlainObjective(*(torch.tensor(part) for part in parts))
         self.pairs = len(i)
 
     @staticmethod
@@ -87,24 +75,12 @@ class Published:
         return mixture.means[kept], mixture.covariances[kept], phi, mixture.colours[kept], mixture.labels[kept]
 
     def value(self, q, t):
-        R = rotation(q)
-        d = self.mu @ R.T + t - self.mu_y
-        S = R @ self.S @ R.T + self.S_y
-        D = (d * torch.linalg.solve(S, d[..., None])[..., 0]).sum(-1)
-        return (self.weight * torch.linalg.det(S) ** -0.5 * torch.exp(-0.5 * D)).sum()
+        return self.objective.value(q, t)
 
     def path(self, T, steps):
         """Poses and values of f on the way."""
-        q, t = quaternion(T[:3, :3]).requires_grad_(), torch.tensor(T[:3, 3]).requires_grad_()
-        optimiser = Adam([{"params": [q], "lr": 3e-6}, {"params": [t], "lr": 9e-5}])
-        poses, values = [matrix(q, t)], [self.value(q, t).item()]
-        for _ in range(steps):
-            optimiser.zero_grad()
-            (-self.value(q, t)).backward()
-            optimiser.step()
-            poses.append(matrix(q, t))
-            values.append(self.value(q, t).item())
-        return poses, values
+        visited = self.objective.path(quaternion(T[:3, :3]), torch.tensor(T[:3, 3]), steps)
+        return [matrix(q, t) for q, t in visited], [self.value(q, t).item() for q, t in visited]
 
 
 @pytest.fixture(scope="module")
