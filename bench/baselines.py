@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from bench.odometry import rgbd_odometry
 from bench.pnp import Failure, features_pnp
 from garps_core.checks import Float64Array
 from garps_core.geometry import pixel_rays
@@ -30,6 +31,8 @@ FAST_LEVELS: Levels = ((0.08, 0.5), (0.06, 0.25), (0.04, 0.1))
 CLOUD_STRIDE = 2
 ITERATIONS = 50
 MIN_POINTS = 100
+KISS_VOXEL_M = 0.05
+"""Of the keypoints for KISS-Matcher: at 0.08 and 0.1 m it is right less often on clouds of one room."""
 EDGE_RATIO = 0.04
 """Pixels whose neighbour's depth differs by more than this share lie at an edge."""
 
@@ -148,12 +151,11 @@ def open3d_plane(source: View, target: View, T_start: Float64Array | None) -> Fl
     return _open3d_levels(source, target, T_start, "plane")
 
 
-@_never_raises
-def small_gicp(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+def _small_gicp(source: View, target: View, T_start: Float64Array) -> Float64Array:
     """GICP of small_gicp: first and last level, two threads."""
     import small_gicp as library
 
-    T = _need_start(T_start)
+    T = T_start
     points = [cloud(view)[0] for view in (source, target)]
     for voxel, distance in (LEVELS[0], LEVELS[-1]):
         prepared = [library.preprocess_points(part, voxel, num_threads=2) for part in points]
@@ -175,9 +177,47 @@ def small_gicp(source: View, target: View, T_start: Float64Array | None) -> Floa
 
 
 @_never_raises
+def small_gicp(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+    """GICP of small_gicp."""
+    return _small_gicp(source, target, _need_start(T_start))
+
+
+@_never_raises
+def rgbd_hybrid(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+    """RGB-D odometry of Open3D, colour and depth (`bench.odometry`)."""
+    return rgbd_odometry(source, target, _need_start(T_start), "hybrid")
+
+
+@_never_raises
+def rgbd_intensity(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+    """RGB-D odometry of Open3D, colour alone (`bench.odometry`)."""
+    return rgbd_odometry(source, target, _need_start(T_start), "intensity")
+
+
+@_never_raises
 def sift_pnp(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
     """RootSIFT and PnP both ways (`bench.pnp`). Ignores the start."""
     return features_pnp(source, target)
+
+
+@_never_raises
+def sift_pnp_small_gicp(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+    """The pose of `sift_pnp`, refined by GICP of small_gicp. Ignores the start."""
+    return _small_gicp(source, target, features_pnp(source, target))
+
+
+@_never_raises
+def kiss_matcher_gicp(source: View, target: View, T_start: Float64Array | None) -> Float64Array:
+    """KISS-Matcher (global registration of clouds), refined by Generalized ICP of Open3D. Ignores the start."""
+    import kiss_matcher
+
+    matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel_size=KISS_VOXEL_M))
+    found = matcher.estimate(*(cloud(view)[0].astype(np.float32) for view in (source, target)))
+    if not found.valid:
+        raise Failure("KISS-Matcher found no valid pose")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.asarray(found.rotation), np.ravel(found.translation)
+    return _open3d_levels(source, target, T, "gicp")
 
 
 METHODS: dict[str, Method] = {
@@ -186,6 +226,10 @@ METHODS: dict[str, Method] = {
     "open3d-colored-fast": open3d_colored_fast,
     "open3d-plane": open3d_plane,
     "small-gicp": small_gicp,
+    "rgbd-hybrid": rgbd_hybrid,
+    "rgbd-intensity": rgbd_intensity,
     "sift-pnp": sift_pnp,
+    "sift-pnp+small-gicp": sift_pnp_small_gicp,
+    "kiss-matcher+gicp": kiss_matcher_gicp,
 }
-NEED_NO_START = ("sift-pnp",)
+NEED_NO_START = ("sift-pnp", "sift-pnp+small-gicp", "kiss-matcher+gicp")

@@ -10,9 +10,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -22,7 +23,10 @@ from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.geometry import pixel_rays, skew, transform
 from garps_core.types import Prior, View
 
+Item = TypeVar("Item")
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+HALVES = ("all", "dev", "held-out")
+"""Parameters are chosen on the first half, figures reported on the other."""
 RGBD_SETS = ("hololens_lounge", "tum_fr1_rpy")
 TRUTH_REACH = {
     ("hololens_lounge", "small"): (0.010, 0.3),
@@ -73,13 +77,33 @@ def available(data: Path = DATA) -> list[str]:
     return [name for name in RGBD_SETS if (data / "dev" / name / "pairs.json").is_file()]
 
 
-def load_pairs(name: str, data: Path = DATA, limit: int | None = None) -> list[Pair]:
-    """Read one set, at most `limit` pairs spread evenly over it. Raises FileNotFoundError when it is not there."""
+def load_pairs(name: str, data: Path = DATA, limit: int | None = None, half: str = "all") -> list[Pair]:
+    """Read one set, or its half, at most `limit` pairs spread evenly over it.
+
+    Raises:
+        FileNotFoundError: the set is not there.
+        ValueError: no such half.
+    """
     folder = data / "dev" / name
     records = json.loads((folder / "pairs.json").read_text())["pairs"]
-    if limit is not None and limit < len(records):
-        records = [records[i] for i in np.linspace(0, len(records) - 1, limit).round().astype(int)]
+    chosen = ids_of_half([record["id"] for record in records], half)
+    records = spread([record for record in records if record["id"] in chosen], limit)
     return [_pair(name, folder, record) for record in records]
+
+
+def ids_of_half(ids: Iterable[str], half: str) -> set[str]:
+    """Which pairs belong to a half of `HALVES`, by their ids alone: sorted by CRC-32, they alternate."""
+    if half not in HALVES:
+        raise ValueError(f"half is {half!r}: expected one of {', '.join(HALVES)}")
+    mixed = sorted(ids, key=lambda name: (zlib.crc32(name.encode()), name))
+    return set({"dev": mixed[::2], "held-out": mixed[1::2], "all": mixed}[half])
+
+
+def spread(items: list[Item], limit: int | None) -> list[Item]:
+    """At most `limit` of them, spread evenly."""
+    if limit is None or limit >= len(items):
+        return items
+    return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]
 
 
 def _pair(name: str, folder: Path, record: dict[str, Any]) -> Pair:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy on real RGB-D pairs: GARPS against its start and against its peers, from the same starts, in one run.
+"""Accuracy on RGB-D pairs: GARPS against its start and against its peers, from the same starts, in one run.
 
+    python -m bench.rgbd --full                 # every accuracy figure: both depths, all sets, starts and methods
+    python -m bench.rgbd --full --resume        # goes on with one that was stopped
     python -m bench.rgbd
     python -m bench.rgbd --monocular
     python -m bench.rgbd --sets hololens_lounge --starts disturbed --methods garps,small-gicp
 
-Rows (one per pair, start and method) go to rows.csv and run.json, tables to table.md; `summarise` needs only rows.
+Rows (one per pair, start and method) go to rows.jsonl as they come, and to rows.csv and run.json, tables to table.md.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -21,18 +23,24 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from bench import acceptance, bare
+from bench.acceptance import START
 from bench.baselines import METHODS
-from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, truth_covariance, with_monocular_depth
-from bench.tables import Row, machine_facts, print_tables, summarise, write
+from bench.datasets import DATA, HALVES, Pair, disturbed_prior, truth_covariance
+from bench.plan import STARTS, Part, pairs_of, parts
+from bench.runs import Key, RowLog, reusable_rows
+from bench.tables import GARPS, Row, machine_facts, print_tables, write
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 from garps_core.settings import changed_config
 
-GARPS, START = "garps", "(start)"
-TABLE_WIDTH = 170
+GARPS_NO_FEATURES = "garps-no-features"
+"""GARPS with `start.features` off: run only where the setting exists, and where the start is not its own features."""
+FEATURES = "start.features"
+VARIANTS = (GARPS, GARPS_NO_FEATURES)
+TABLE_WIDTH = 200
 """Columns of a table that goes to a file or a pipe."""
 PEERS = ("open3d-gicp", "open3d-colored", "small-gicp", "sift-pnp")
-STARTS = ("features", "disturbed", "identity")
 
 
 def evaluate(
@@ -48,50 +56,74 @@ def evaluate(
     Args:
         config: settings of GARPS; its `start.method` is set here.
         pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
-        start: "features" (GARPS' own features + PnP), "disturbed" (truth off by 1 deg and 0.12 m, given as a prior)
-            or "identity".
-        methods: "garps" and names from `bench.baselines.METHODS`. GARPS always runs where the start comes from it.
+        start: "features" (GARPS' own features + PnP), "disturbed" (truth off by 1 deg and 0.12 m, given as a prior),
+            "identity", or "none" (GARPS starts as it sees fit, peers that need a start from identity).
+        methods: "garps", "garps-no-features" and names from `bench.baselines.METHODS`. GARPS always runs where the
+            start comes from it.
         seed: of the disturbance.
         progress: wraps the pairs, for a progress bar.
     Returns: rows, per pair first "(start)", then the methods in order.
     """
-    rows: list[Row] = []
-    for pair in progress(pairs):
-        rows += _evaluate_pair(config, pair, start, list(methods), seed)
-    return rows
+    chosen = list(methods)
+    return [row for pair in progress(pairs) for row in evaluate_pair(config, pair, start, chosen, seed)]
 
 
-def _evaluate_pair(config: Config, pair: Pair, start: str, methods: list[str], seed: int) -> list[Row]:
+def evaluate_pair(
+    config: Config,
+    pair: Pair,
+    start: str,
+    methods: Sequence[str],
+    seed: int = 0,
+    known: Mapping[str, Row] | None = None,
+) -> list[Row]:
+    """`evaluate` on one pair; peers in `known` are not run, their rows are taken from there."""
     prior = disturbed_prior(pair, seed) if start == "disturbed" else None
     initial, estimate, seconds = prior, None, float("nan")
     if GARPS in methods or prior is None:
         estimate, seconds = run_garps(config, pair, start, prior)
         initial = estimate.initial if prior is None else prior
+    rows = [_start_row(pair, start, initial, estimate if prior is None else None)]
     T_start = None if initial is None else initial.T_target_source
-    start_seconds = estimate.seconds.get("initialise", float("nan")) if estimate and prior is None else float("nan")
-    start_reason = "" if initial is not None or estimate is None else estimate.reason
-    rows = [_row(pair, start, START, T_start, start_seconds, start_reason, initial and initial.covariance)]
     for name in methods:
         if name == GARPS and estimate is not None:
-            row = _row(pair, start, GARPS, estimate.T_target_source, seconds, estimate.reason, estimate.covariance) | {
-                "status": estimate.status.value,
-                "origin": "" if estimate.initial is None else estimate.initial.origin,
-                "overlap": estimate.overlap,
-                "iterations": estimate.iterations,
-                "objective": estimate.objective,
-                **{f"seconds_{stage}": value for stage, value in estimate.seconds.items()},
-            }
-            rows.append(row)
-        elif name != GARPS:
+            rows.append(_garps_row(pair, start, GARPS, estimate, seconds))
+        elif name == GARPS_NO_FEATURES:
+            if FEATURES in config.settings() and start in ("disturbed", "identity"):
+                without = run_garps(config.replace({FEATURES: False}), pair, start, prior)
+                rows.append(_garps_row(pair, start, name, *without))
+        elif known and name in known:
+            rows.append(known[name])
+        else:
             began = time.perf_counter()
-            T, reason = METHODS[name](pair.source, pair.target, T_start)
+            T, reason = METHODS[name](pair.source, pair.target, np.eye(4) if start == "none" else T_start)
             rows.append(_row(pair, start, name, T, time.perf_counter() - began, reason))
     return rows
 
 
+def _start_row(pair: Pair, start: str, initial: Prior | None, own: PoseEstimate | None) -> Row:
+    """The pose before the alignment; `own` = GARPS' estimate where it chose the pose itself."""
+    seconds = float("nan") if own is None else own.seconds.get("initialise", float("nan"))
+    if initial is None:
+        return _row(pair, start, START, None, seconds, "" if own is None else own.reason)
+    return _row(pair, start, START, initial.T_target_source, seconds, "", initial.covariance)
+
+
+def _garps_row(pair: Pair, start: str, name: str, estimate: PoseEstimate, seconds: float) -> Row:
+    row = _row(pair, start, name, estimate.T_target_source, seconds, estimate.reason, estimate.covariance)
+    return row | {
+        "status": estimate.status.value,
+        "origin": "" if estimate.initial is None else estimate.initial.origin,
+        "overlap": estimate.overlap,
+        "quality": float(getattr(estimate, "quality", float("nan"))),
+        "iterations": estimate.iterations,
+        "objective": estimate.objective,
+        **{f"seconds_{stage}": value for stage, value in estimate.seconds.items()},
+    }
+
+
 def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tuple[PoseEstimate, float]:
     """GARPS from one kind of start: the estimate and its wall time in s."""
-    method = {"features": "features", "identity": "identity", "disturbed": "auto"}[start]
+    method = {"features": "features", "identity": "identity", "disturbed": "auto", "none": "auto"}[start]
     config = config.replace({"start.method": method})
     began = time.perf_counter()
     try:
@@ -131,45 +163,97 @@ def _row(
     return row
 
 
-def _settings(preset: str | None, changes: Sequence[str], monocular: bool) -> Config:
-    return changed_config(Config.preset(preset or ("monocular" if monocular else "sensor")), changes)
-
-
 def main(
     sets: Annotated[str, typer.Option(help="comma-separated; default: all that are there")] = "",
-    preset: Annotated[str | None, typer.Option(help="of GARPS; default: sensor, or monocular with --monocular")] = None,
-    starts: Annotated[str, typer.Option(help="comma-separated from features, disturbed, identity")] = "",
-    methods: Annotated[str, typer.Option(help=f"comma-separated from garps, {', '.join(METHODS)}")] = "",
+    preset: Annotated[str | None, typer.Option(help="of GARPS; default: sensor or monocular, by the depth")] = None,
+    starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}, none")] = "",
+    methods: Annotated[str, typer.Option(help=f"comma-separated from {', '.join((*VARIANTS, *METHODS))}")] = "",
     monocular: Annotated[bool, typer.Option(help="spoil the depth as a metric monocular network would")] = False,
     limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, spread evenly")] = None,
-    full: Annotated[bool, typer.Option(help="all peers unless given")] = False,
+    full: Annotated[
+        bool, typer.Option(help="both depths, the bare rooms, all methods, and the acceptance table")
+    ] = False,
+    half: Annotated[
+        str, typer.Option(help=f"of each set: {', '.join(HALVES)}; dev takes bare rooms to tune on")
+    ] = "all",
+    resume: Annotated[bool, typer.Option(help="go on with the run in --out")] = False,
+    reuse_peers: Annotated[Path | None, typer.Option(help="run.json to take the peers' rows from")] = None,
     change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
     data: Annotated[Path, typer.Option(help="folder that holds dev/<set>/pairs.json")] = DATA,
+    bare_rooms: Annotated[Path, typer.Option(help="folder of the generated bare rooms")] = bare.FOLDER,
     out: Annotated[Path, typer.Option(help="where rows and tables go")] = Path("out/rgbd"),
     seed: Annotated[int, typer.Option(help="of disturbances and spoilt depth")] = 0,
 ) -> None:
-    """Accuracy on real RGB-D pairs."""
+    """Accuracy on RGB-D pairs."""
     console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
-    names = sets.split(",") if sets else available(data)
-    if not names:
-        console.print(f"no data under {data / 'dev'}: give its folder with --data")
-        raise typer.Exit(2)
-    default_methods = (GARPS, *METHODS) if full else (GARPS, *PEERS)
-    config, rows = _settings(preset, change or [], monocular), []
-    facts = {"depth": "monocular-like" if monocular else "sensor", "seed": seed, **machine_facts()}
-    for name in names:
-        pairs = load_pairs(name, data, limit)
-        if monocular:
-            pairs = [with_monocular_depth(pair, seed) for pair in pairs]
-        for start in starts.split(",") if starts else STARTS:
-            chosen = methods.split(",") if methods else list(default_methods)
-            # Compiles, so that no pair's time holds it.
-            run_garps(config, pairs[0], "disturbed", disturbed_prior(pairs[0]))
-            bar = lambda part: track(part, f"{name}, {start}", console=console)  # noqa: B023, E731
-            rows += evaluate(config, pairs, start, chosen, seed, bar)
-            write(out, rows, facts | {"settings": config.settings()})
-    print_tables(console, summarise(rows))
+    try:
+        planned = parts(full, monocular, _split(sets), _split(starts), half, data)
+        chosen = _split(methods) or ([*VARIANTS, *METHODS] if full else [GARPS, *PEERS])
+        _check_methods(chosen)
+        if full and preset:
+            raise ValueError("--full takes the preset of each depth: leave out --preset")
+        presets = dict.fromkeys(part.depth for part in planned)
+        configs = {depth: changed_config(Config.preset(preset or depth), change or []) for depth in presets}
+        settings = {depth: config.settings() for depth, config in configs.items()}
+        known = reusable_rows(reuse_peers, seed) if reuse_peers else {}
+        options = {"parts": [part._asdict() for part in planned], "methods": chosen, "settings": settings, "seed": seed}
+        options |= {"limit": limit, "half": half, "reuse_peers": str(reuse_peers or "")}
+        log = RowLog(out, options, resume)
+    except (ValueError, GarpsError) as error:
+        console.print(str(error), soft_wrap=True)
+        raise typer.Exit(2) from None
+    facts: Row = {"depth": ", ".join(configs), "half": half, "seed": seed, **machine_facts()} | {"settings": settings}
+
+    for part in planned:
+        pairs = pairs_of(part, data, bare_rooms, half, limit, seed, console)
+        _run_part(configs[part.depth], part, pairs, chosen, seed, known, log, console)
+        if reuse_peers:
+            facts["reused_peers"] = _reuse_note(log.rows, reuse_peers)
+        write(out, log.rows, facts)
+    print_tables(console, log.rows, facts)
+    if full:
+        found = acceptance.bars(log.rows)
+        acceptance.print_bars(console, found)
+        write(out, log.rows, facts, acceptance.markdown_bars(found))
     console.print(f"rows and tables: {out}")
+
+
+def _split(text: str) -> list[str]:
+    return text.split(",") if text else []
+
+
+def _check_methods(chosen: Sequence[str]) -> None:
+    unknown = [name for name in chosen if name not in (*VARIANTS, *METHODS)]
+    if unknown:
+        raise ValueError(f"no method {', '.join(unknown)}: expected some of {', '.join((*VARIANTS, *METHODS))}")
+
+
+def _run_part(
+    config: Config,
+    part: Part,
+    pairs: Sequence[Pair],
+    methods: Sequence[str],
+    seed: int,
+    known: Mapping[Key, Mapping[str, Row]],
+    log: RowLog,
+    console: Console,
+) -> None:
+    """Rows of the pairs of one table that the log does not have yet."""
+    keys = [(part.depth, part.set, part.start, pair.id) for pair in pairs]
+    missing = [(key, pair) for key, pair in zip(keys, pairs, strict=True) if key not in log.done]
+    if not missing:
+        return
+    # Compiles, so that no pair's time holds it.
+    run_garps(config, pairs[0], "disturbed", disturbed_prior(pairs[0]))
+    for key, pair in track(missing, f"{part.depth}, {part.set}, {part.start}", console=console):
+        made = evaluate_pair(config, pair, part.start, methods, seed, known.get(key))
+        log.add([{"depth": part.depth} | row for row in made])
+
+
+def _reuse_note(rows: Sequence[Row], path: Path) -> str:
+    peers = [row for row in rows if row["method"] in METHODS]
+    count = sum(bool(row.get("reused")) for row in peers)
+    return f"{count} of {len(peers)} rows of peers, times included, were not run anew but taken from {path}."
 
 
 if __name__ == "__main__":

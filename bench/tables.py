@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From rows (one per pair, start and method, as `bench.rgbd.evaluate` gives them) to summaries, tables and files."""
+"""From rows (one per depth, pair, start and method, as `bench.rgbd` makes them) to summaries, tables and files."""
 
 from __future__ import annotations
 
@@ -10,61 +10,88 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import rankdata
 
 from garps_core import metrics
 
 Row = dict[str, Any]
+GARPS = "garps"
 SUCCESS_M, SUCCESS_DEG = 0.05, 2.0
+MAP_FREE_M, MAP_FREE_DEG = 0.25, 5.0
+"""What the Map-free relocalisation benchmark calls a usable pose."""
 COLUMNS = {
     "n": "poses / pairs",
     "e_trans_m": "E_trans m",
     "e_rot_deg": "E_rot deg",
     "e_3d_m": "E_3D m",
+    "p90_e_3d_m": "P90 E_3D m",
     "mean_e_trans_m": "mean E_trans m",
     "success": "success",
+    "map_free": "< 25 cm & 5 deg",
     "seconds": "s",
     "nees_95": "NEES < 12.59",
     "wrong_ok": "wrong & converged",
     "statuses": "statuses",
 }
 CAPTION = (
-    f"Medians over all pairs, failures at infinity; mean over the poses that exist; success: under {SUCCESS_M:g} m "
-    f"and {SUCCESS_DEG:g} deg, of all pairs; NEES: share within the 95 % bound of chi-square, 6 dof; "
+    "Medians and 90th percentile over all pairs, failures at infinity; mean over the poses that exist; success: under "
+    f"{SUCCESS_M:g} m and {SUCCESS_DEG:g} deg, of all pairs; NEES: share within the 95 % bound of chi-square, 6 dof; "
     "wrong & converged: share of pairs reported as converged that are no success; s: from the images, for the peers "
     "without the time of the start they were given."
 )
 
 
+def is_right(row: Row, metres: float = SUCCESS_M, degrees: float = SUCCESS_DEG) -> bool:
+    """Whether a row's pose is within both bounds; a failure, at infinity, is not."""
+    return bool(row["e_trans_m"] < metres and row["e_rot_deg"] < degrees)
+
+
 def summarise(rows: Sequence[Row]) -> list[Row]:
-    """Rows -> one line per set, start, category (small, large, all) and method, in order of first appearance."""
+    """Rows -> one line per depth, set, start, category (small, large, all) and method, in order of first appearance."""
     lines: list[Row] = []
-    for key in dict.fromkeys((row["set"], row["start"]) for row in rows):
-        group = [row for row in rows if (row["set"], row["start"]) == key]
+    for depth, name, start in _tables_of(rows):
+        group = [row for row in rows if _table_of(row) == (depth, name, start)]
         for category in (*sorted({row["category"] for row in group}, reverse=True), "all"):
             for method in dict.fromkeys(row["method"] for row in group):
                 part = [r for r in group if r["method"] == method and category in ("all", r["category"])]
-                names = {"set": key[0], "start": key[1], "category": category, "method": method}
-                lines.append(names | _statistics(part))
+                if part:
+                    names = {"depth": depth, "set": name, "start": start, "category": category, "method": method}
+                    lines.append(names | _statistics(part))
     return lines
+
+
+def _table_of(row: Row) -> tuple[str, str, str]:
+    """What one table holds: the depth ("" where a row does not say), the set and the start."""
+    return row.get("depth", ""), row["set"], row["start"]
+
+
+def _tables_of(rows: Sequence[Row]) -> list[tuple[str, str, str]]:
+    """Tables in order of first appearance, those of a depth and of a set together."""
+    found = list(dict.fromkeys(_table_of(row) for row in rows))
+    first = {key[:length]: i for length in (1, 2) for i, key in reversed(list(enumerate(found)))}
+    return sorted(found, key=lambda key: (first[key[:1]], first[key[:2]]))
 
 
 def _statistics(rows: Sequence[Row]) -> Row:
     found = [row for row in rows if row["found"]]
-    good = [row["e_trans_m"] < SUCCESS_M and row["e_rot_deg"] < SUCCESS_DEG for row in rows]
+    good = [is_right(row) for row in rows]
     line: Row = {"n": f"{len(found)}/{len(rows)}"}
     line |= {name: float(np.median([row[name] for row in rows])) for name in ("e_trans_m", "e_rot_deg", "e_3d_m")}
+    # "higher" takes a value that is there: between two infinite ones there is nothing to interpolate.
+    line["p90_e_3d_m"] = float(np.quantile([row["e_3d_m"] for row in rows], 0.9, method="higher"))
     line["mean_e_trans_m"] = float(np.mean([row["e_trans_m"] for row in found])) if found else float("nan")
     line["success"] = float(np.mean(good))
+    line["map_free"] = float(np.mean([is_right(row, MAP_FREE_M, MAP_FREE_DEG) for row in rows]))
     line["seconds"] = float(np.median([row["seconds"] for row in rows]))
-    values = [row["nees"] for row in rows if "nees" in row]
-    line["nees_95"] = float(np.mean(np.array(values) < metrics.CHI2_6_95)) if values else float("nan")
+    line["nees_95"] = coverage(rows)[0]
     states = [row["status"] for row in rows if "status" in row]
     if states:
         wrong = [row.get("status") == "converged" and not ok for row, ok in zip(rows, good, strict=True)]
@@ -73,20 +100,76 @@ def _statistics(rows: Sequence[Row]) -> Row:
     return line
 
 
+def coverage(rows: Sequence[Row]) -> tuple[float, int]:
+    """Share of the poses with a covariance whose NEES is within the 95 % bound (NaN without any), and their number."""
+    values = np.array([row["nees"] for row in rows if "nees" in row])
+    return (float(np.mean(values < metrics.CHI2_6_95)) if len(values) else float("nan")), len(values)
+
+
+def roc_auc(scores: npt.ArrayLike, right: npt.ArrayLike) -> float:
+    """Chance that a right one scores above a wrong one, a tie counting half; NaN when all are right or all wrong."""
+    chosen = np.asarray(right, bool)
+    n_right, n_wrong = int(chosen.sum()), int((~chosen).sum())
+    if n_right == 0 or n_wrong == 0 or np.isnan(np.asarray(scores, float)).any():
+        return float("nan")
+    ranks = rankdata(np.asarray(scores, float))
+    return float((ranks[chosen].sum() - n_right * (n_right + 1) / 2) / (n_right * n_wrong))
+
+
+def quality_auc(rows: Sequence[Row]) -> tuple[float, str]:
+    """How well `quality` tells right poses from wrong ones over these rows, and the same for people.
+
+    A failure has quality 0. NaN, with the reason, where there is no quality or nothing to tell apart.
+    """
+    right = [is_right(row) for row in rows]
+    quality = [row.get("quality", float("nan")) if row["found"] else 0.0 for row in rows]
+    counts = f"{sum(right)} of {len(rows)} within {100 * SUCCESS_M:g} cm and {SUCCESS_DEG:g} deg"
+    if np.isnan(quality).any():
+        return float("nan"), f"undefined, estimates have no quality ({counts})"
+    if all(right) or not any(right):
+        return float("nan"), f"undefined, all are {'right' if all(right) else 'wrong'} ({counts})"
+    value = roc_auc(quality, right)
+    return value, f"{value:.3f} ({counts})"
+
+
+def confidence_line(rows: Sequence[Row], title: str) -> str:
+    """GARPS' quality and covariance over its rows: AUC and NEES coverage with n."""
+    own = [row for row in rows if row["method"] == GARPS]
+    share, n = coverage(own)
+    covered = f"{100 * share:.0f} % within the 95 % bound (n = {n})" if n else "no covariances"
+    return f"{title}: AUC of GARPS' quality {quality_auc(own)[1]}; NEES: {covered}"
+
+
+def sections(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row], list[str]]]:
+    """Per table: title, lines, and what stands below it (after the last of a set, and the last of a depth)."""
+    lines, keys = summarise(rows), _tables_of(rows)
+    for key, following in zip(keys, [*keys[1:], ("", "", "")], strict=True):
+        depth, name, start = key
+        below = []
+        pooled = [row for row in rows if _table_of(row)[0] == depth]
+        if any(row["method"] == GARPS for row in pooled):
+            if following[:2] != key[:2]:
+                part = [row for row in pooled if row["set"] == name]
+                below.append(confidence_line(part, f"{depth} depth, {name}, all starts"))
+            if following[0] != depth or following[1] == "":
+                below.append(confidence_line(pooled, f"{depth} depth, all sets and starts"))
+        title = f"{depth} depth, {name}, start: {start}"
+        yield title, [line for line in lines if _table_of(line) == key], below
+
+
 def _cell(name: str, value: Any) -> str:
     if not isinstance(value, float):
         return "" if value is None else str(value)
     if np.isnan(value):
         return ""
-    digits = {"e_rot_deg": 2, "success": 2, "nees_95": 2, "wrong_ok": 2, "seconds": 3}.get(name, 4)
+    digits = {"e_rot_deg": 2, "success": 2, "map_free": 2, "nees_95": 2, "wrong_ok": 2, "seconds": 3}.get(name, 4)
     return f"{value:.{digits}f}"
 
 
-def print_tables(console: Console, lines: Sequence[Row]) -> None:
-    """One table per set and start."""
-    for key in dict.fromkeys((line["set"], line["start"]) for line in lines):
-        table = Table(title=f"{key[0]}, start: {key[1]}", title_justify="left")
-        part = [line for line in lines if (line["set"], line["start"]) == key]
+def print_tables(console: Console, rows: Sequence[Row], facts: Row) -> None:
+    """One table per depth, set and start."""
+    for title, part, below in sections(rows):
+        table = Table(title=title, title_justify="left")
         shown = [name for name in COLUMNS if any(_cell(name, line.get(name)) for line in part)]
         for heading in ("pairs", "method", *(COLUMNS[name] for name in shown)):
             left = heading in ("pairs", "method", "statuses")
@@ -96,26 +179,45 @@ def print_tables(console: Console, lines: Sequence[Row]) -> None:
             cells = [_cell(name, line.get(name)) for name in shown]
             table.add_row(line["category"], line["method"], *cells, end_section=last)
         console.print(table)
-    console.print(CAPTION)
+        for text in below:
+            console.print(text)
+    console.print(caption(facts))
 
 
-def markdown(lines: Sequence[Row], facts: Row) -> str:
+def caption(facts: Row) -> str:
+    """What the columns mean, and where rows were taken over from an earlier run."""
+    if not facts.get("reused_peers"):
+        return CAPTION
+    return f"{CAPTION} {facts['reused_peers']}"
+
+
+def markdown(rows: Sequence[Row], facts: Row) -> str:
     """The same as `print_tables`, for a document."""
-    text = [f"{CAPTION}\n", "; ".join(f"{name} {value}" for name, value in facts.items() if name != "settings") + "\n"]
-    for key in dict.fromkeys((line["set"], line["start"]) for line in lines):
-        headings = ["pairs", "method", *COLUMNS.values()]
-        text += [f"### {key[0]}, start: {key[1]}\n", f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
-        for line in lines:
-            if (line["set"], line["start"]) == key:
-                cells = [line["category"], line["method"], *(_cell(name, line.get(name)) for name in COLUMNS)]
-                text.append(f"| {' | '.join(cells)} |")
-        text.append("")
+    short = "; ".join(f"{name} {value}" for name, value in facts.items() if name not in ("settings", "reused_peers"))
+    text = [f"{caption(facts)}\n", f"{short}\n"]
+    headings = ["pairs", "method", *COLUMNS.values()]
+    for title, part, below in sections(rows):
+        text += [f"### {title}\n", f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+        for line in part:
+            cells = [line["category"], line["method"], *(_cell(name, line.get(name)) for name in COLUMNS)]
+            text.append(f"| {' | '.join(cells)} |")
+        text += ["", *(f"{line}\n" for line in below)]
     return "\n".join(text)
 
 
 def machine_facts() -> Row:
     """What a reader needs to judge the numbers: processor, versions, commit."""
-    names = ("numpy", "scipy", "numba", "torch", "opencv-python-headless", "open3d-cpu", "small_gicp", "poselib")
+    names = (
+        "numpy",
+        "scipy",
+        "numba",
+        "torch",
+        "opencv-python-headless",
+        "open3d-cpu",
+        "small_gicp",
+        "poselib",
+        "kiss_matcher",
+    )
     cpuinfo = Path("/proc/cpuinfo")
     models = [line for line in cpuinfo.read_text().splitlines() if "model name" in line] if cpuinfo.is_file() else []
     facts = {"cpu": models[0].split(":")[1].strip() if models else platform.machine(), "cores": os.cpu_count() or ""}
@@ -136,8 +238,8 @@ def _commit() -> str:
         return ""
 
 
-def write(out: Path, rows: Sequence[Row], facts: Row) -> None:
-    """rows.csv, run.json (rows, facts) and table.md into a folder."""
+def write(out: Path, rows: Sequence[Row], facts: Row, end: str = "") -> None:
+    """rows.csv, run.json (rows, facts) and table.md, which closes with `end`, into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (out / "rows.csv").open("w", newline="") as file:
@@ -146,4 +248,4 @@ def write(out: Path, rows: Sequence[Row], facts: Row) -> None:
         writer.writerows(rows)
     finite = [{name: None if value in (np.inf, -np.inf) else value for name, value in row.items()} for row in rows]
     (out / "run.json").write_text(json.dumps({"facts": facts, "rows": finite}, indent=1, default=dataclasses.asdict))
-    (out / "table.md").write_text(markdown(summarise(rows), facts))
+    (out / "table.md").write_text(markdown(rows, facts) + end)
