@@ -7,14 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.baselines import METHODS, Result
+from bench.baselines import METHODS
 from bench.datasets import Pair, disturbed_prior
 from bench.speed_parts import Check, Inputs, Row, Section, interleaved, medians
-from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
+from garps_core import Config, PoseEstimate, Prior, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 
 GARPS, GARPS_PRIOR, CHAIN = "garps", "garps, start given", "sift-pnp+small-gicp"
-PEERS = ("open3d-colored", "open3d-colored-fast", "small-gicp", "sift-pnp")
+PEERS = ("open3d-colored", "open3d-colored-fast", "small-gicp", "sift-pnp", CHAIN)
 BAR = 1.0
 Call = Callable[[], Float64Array | None]
 
@@ -66,14 +66,7 @@ def _calls(pair: Pair, config: Config, prior: Prior, estimates: dict[str, list[P
         return lambda: METHODS[name](pair.source, pair.target, prior.T_target_source).T
 
     calls = {GARPS: garps(GARPS, None), GARPS_PRIOR: garps(GARPS_PRIOR, prior)}
-    calls |= {name: peer(name) for name in PEERS}
-    return calls | {CHAIN: lambda: features_then_gicp(pair.source, pair.target).T}
-
-
-def features_then_gicp(source: View, target: View) -> Result:
-    """SIFT and PnP for the start, small_gicp's GICP from there."""
-    start = METHODS["sift-pnp"](source, target, None)
-    return start if start.T is None else METHODS["small-gicp"](source, target, start.T)
+    return calls | {name: peer(name) for name in PEERS}
 
 
 def _error(T: Float64Array | None, pair: Pair) -> float:
