@@ -75,7 +75,7 @@ def pairs_of(
     Generated rooms have two splits of their own: the one to tune on for the half "dev", else the one to report.
     """
     if part.set == bare.SET:
-        return spread(bare.load_with_bar("tune" if half == "dev" else "report", bare_rooms, console).pairs, limit)
+        return spread(_generated("tune" if half == "dev" else "report", bare_rooms, console), limit)
     return _recorded(part.depth, part.set, data, half, limit, seed)
 
 
@@ -83,3 +83,8 @@ def pairs_of(
 def _recorded(depth: str, name: str, data: Path, half: str, limit: int | None, seed: int) -> list[Pair]:
     pairs = load_pairs(name, data, limit, half)
     return [with_monocular_depth(pair, seed) for pair in pairs] if depth == MONOCULAR else pairs
+
+
+@lru_cache(maxsize=1)
+def _generated(split: str, folder: Path, console: Console) -> list[Pair]:
+    return bare.load_with_bar(split, folder, console).pairs

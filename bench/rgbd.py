@@ -192,6 +192,8 @@ def main(
         _check_methods(chosen)
         if full and preset:
             raise ValueError("--full takes the preset of each depth: leave out --preset")
+        if reuse_peers and reuse_peers.resolve().parent == out.resolve():
+            raise ValueError(f"{reuse_peers} lies in --out and would be overwritten: choose another --out")
         presets = dict.fromkeys(part.depth for part in planned)
         configs = {depth: changed_config(Config.preset(preset or depth), change or []) for depth in presets}
         settings = {depth: config.settings() for depth, config in configs.items()}
@@ -252,8 +254,9 @@ def _run_part(
 
 def _reuse_note(rows: Sequence[Row], path: Path) -> str:
     peers = [row for row in rows if row["method"] in METHODS]
-    count = sum(bool(row.get("reused")) for row in peers)
-    return f"{count} of {len(peers)} rows of peers, times included, were not run anew but taken from {path}."
+    commits = [row["reused"] for row in peers if "reused" in row]
+    origin = f"{path} (commit {', '.join(dict.fromkeys(commits)) or 'none'})"
+    return f"{len(commits)} of {len(peers)} rows of peers, times included, were not run anew but taken from {origin}."
 
 
 if __name__ == "__main__":

@@ -88,14 +88,14 @@ def _differences(stored: Any, given: Any, name: str = "") -> str:
 def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
     """Peers' rows of an earlier run.json that owe nothing to GARPS' code, per pair and method.
 
-    Rows of peers that started from GARPS' own features are left out.
+    Rows of peers that started from GARPS' own features are left out. "reused" in each row is the commit it is from.
 
     Raises:
         ValueError: no run.json, rows from before depth was told apart, or starts drawn from another seed.
     """
     try:
         run = json.loads(path.read_text())
-        rows, earlier_seed = run["rows"], run["facts"]["seed"]
+        rows, earlier_seed, commit = run["rows"], run["facts"]["seed"], run["facts"].get("commit") or "unknown"
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} is no run.json with rows and facts ({error!r}): give that of an earlier run"
@@ -108,7 +108,7 @@ def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
             raise ValueError(f"{path} has rows without depth: it was made by an earlier bench.rgbd; run its peers anew")
         method = row["method"]
         if method in METHODS and (row["start"] != "features" or method in NEED_NO_START):
-            found.setdefault(key_of(row), {})[method] = _with_infinities(row) | {"reused": True}
+            found.setdefault(key_of(row), {})[method] = {"reused": commit} | _with_infinities(row)
     return found
 
 

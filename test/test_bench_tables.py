@@ -145,13 +145,13 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
         made_row("open3d-gicp", INF), made_row("garps"), made_row("(start)"), made_row("garps-no-features"),
         made_row("open3d-gicp", start="features"), made_row("sift-pnp", start="features"),
     ]  # fmt: skip
-    tables.write(tmp_path, rows, {"seed": 0})
+    tables.write(tmp_path, rows, {"seed": 0, "commit": "abc"})
     known = runs.reusable_rows(tmp_path / "run.json", 0)
     assert {key[2]: list(found) for key, found in known.items()} == {
         "disturbed": ["open3d-gicp"],
         "features": ["sift-pnp"],
     }
-    assert known["sensor", "hololens_lounge", "disturbed", "a"]["open3d-gicp"] == {**rows[0], "reused": True}
+    assert known["sensor", "hololens_lounge", "disturbed", "a"]["open3d-gicp"] == {**rows[0], "reused": "abc"}
     with pytest.raises(ValueError, match="made with seed 0, not 1"):
         runs.reusable_rows(tmp_path / "run.json", 1)
     (tmp_path / "old.json").write_text(json.dumps({"facts": {"seed": 0}, "rows": [{"method": "garps"}]}))
@@ -181,7 +181,7 @@ def test_known_rows_of_peers_are_taken_over():
     from garps_core import Config
 
     pair = bare.room_pair(22, 1, WIDTH, HEIGHT)
-    known = {"open3d-gicp": made_row("open3d-gicp", reused=True)}
+    known = {"open3d-gicp": made_row("open3d-gicp", reused="abc")}
     methods = ["garps", "garps-no-features", "open3d-gicp"]
     rows = rgbd.evaluate_pair(Config.preset("monocular"), pair, "none", methods, known=known)
     assert [row["method"] for row in rows] == ["(start)", "garps", "open3d-gicp"]
