@@ -12,16 +12,18 @@ import numpy as np
 import torch
 
 from garps_core import paper, solve
-from garps_core.checks import Float64Array
-from garps_core.config import Alignment, Config
+from garps_core.config import Config
 from garps_core.errors import InitialisationError, InputError
-from garps_core.geometry import se3_inverse, se3_log
-from garps_core.initialise import initialise
-from garps_core.pairing import checked_device, overlap, to_cloud
+from garps_core.initialise import identity, initialise
+from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
+from garps_core.photometric import sharpen
 from garps_core.reconstruct import reconstruct
-from garps_core.solve import MIN_ROWS, Solution, displacement
+from garps_core.search import search
+from garps_core.solve import MIN_ROWS, Belief, Solution
+from garps_core.systematic import DEPTH_MODES, shared_sigmas
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.uncertainty import pose_covariance, twist_from_ros
+from garps_core.uncertainty import pose_covariance, ros_from_twist, twist_from_ros
+from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 
 
 def estimate_relative_pose(
@@ -46,13 +48,30 @@ def estimate_relative_pose(
         x, y = pool.map(reconstruct, (source, target), (config, config))
     lifted = time.perf_counter()
     try:
-        initial = initialise(source, target, config, prior)
+        starts = initialise(source, target, config, prior)
     except InitialisationError as failure:
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds={"reconstruct": lifted - begin})
     initialised = time.perf_counter()
-    estimate = align_mixtures(x, y, initial, config)
-    estimate.seconds.update(reconstruct=lifted - begin, initialise=initialised - lifted)
+    estimate = _best_of(x, y, starts, config)
+    estimate.seconds.update(
+        reconstruct=lifted - begin, initialise=initialised - lifted, align=time.perf_counter() - initialised
+    )
     return estimate
+
+
+def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
+    """The best estimate of several starts; where features led nowhere, also a search from identity is tried."""
+    estimates = [align_mixtures(x, y, start, config) for start in starts]
+    best = max(estimates, key=_merit)
+    if not best.ok and config.start.identity_fallback and starts[0].origin == "features":
+        reason = f"from features: {best.status.value}, {best.reason}"
+        best = max(best, align_mixtures(x, y, identity(config, reason), config), key=_merit)
+    return best
+
+
+def _merit(estimate: PoseEstimate) -> tuple[bool, bool, float]:
+    """Order of preference: a pose to use, then any pose, then quality."""
+    return estimate.ok, estimate.T_target_source is not None, estimate.quality
 
 
 def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:
@@ -109,72 +128,50 @@ class _OneThread(ContextDecorator):
 def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -> PoseEstimate:
     x, y = to_cloud(source, config), to_cloud(target, config)
     settings = config.alignment
-    T0 = initial.T_target_source
-    start_covariance = twist_from_ros(initial.covariance, T0)
-    maximise = paper.maximise if settings.solver == "adam" else solve.anneal
-    solution = maximise(x, y, T0, start_covariance, settings)
-    shared = overlap(x, y, T0 if solution is None else solution.T, settings)
-    if solution is None or shared < settings.min_overlap:
-        reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
-        if shared >= settings.min_overlap:  # then the solver gave up
-            reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
+    known = _known(initial, config)
+    guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
+    maximise = paper.maximise if settings.solver == "adam" else search if guess else solve.anneal
+    findings = [_finding(solution, x, y, known, config) for solution in maximise(x, y, known, settings)]
+    if not findings:
+        shared = overlap(x, y, known.T, settings)
+        reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
         return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
-    precision = np.asarray(np.linalg.inv(start_covariance), np.float64)
-    covariance = pose_covariance(solution, precision, config.lifting)
-    guess = _relative_uncertainty(source, T0, initial.covariance) > settings.guess_uncertainty
-    status, reason = _verdict(
-        solution,
-        initial,
-        settings.guess_support if guess else settings.min_support,
-        _relative_uncertainty(source, solution.T, covariance),
-        settings,
-    )
+    best = max(findings, key=lambda finding: finding.merit)
+    if best.overlap < settings.min_overlap:
+        reason = f"the views share {best.overlap:.0%} of their components, expected at least {settings.min_overlap:.0%}"
+        return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=best.overlap)
+    uncertainty = relative_uncertainty(source, best.T, best.covariance)
+    status, reason = verdict(best, initial, guess, uncertainty, settings)
     return PoseEstimate(
         status,
         reason,
-        solution.T,
-        covariance,
+        best.T,
+        best.covariance,
         initial,
-        shared,
-        solution.iterations,
-        solution.data.value,
+        best.overlap,
+        best.solution.iterations,
+        best.solution.data.value,
+        quality(best, guess),
     )
 
 
-def _relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64Array) -> float:
-    """Sigma of a typical scene point along its most uncertain direction, as a share of its range in the target."""
-    points = source.means[:: max(1, len(source) // 200)].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    spread = np.linalg.eigvalsh(displacement(points, twist_from_ros(covariance, T)))[:, 2]
-    return float(np.median(np.sqrt(spread) / np.linalg.norm(points, axis=1)))
+def _known(initial: Prior, config: Config) -> Belief:
+    """The initial pose as a measurement, and where they are solved for, what depth maps usually get wrong."""
+    precision = np.linalg.inv(twist_from_ros(initial.covariance, initial.T_target_source))
+    of_errors = np.zeros(0)
+    if config.alignment.depth_errors and config.alignment.solver != "adam":
+        of_errors = np.tile(1 / np.maximum(shared_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
+    return Belief(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
 
 
-def _verdict(
-    solution: Solution, initial: Prior, wanted_support: float, uncertainty: float, settings: Alignment
-) -> tuple[Status, str]:
-    """Status and reason of a solution, the gravest first."""
-    if settings.solver == "adam":
-        return Status.CONVERGED, f"the paper's fixed number of steps, {solution.iterations}"
-    T0 = initial.T_target_source
-    r = se3_log(solution.T @ se3_inverse(T0))
-    distance = float(np.sqrt(r @ np.linalg.solve(twist_from_ros(initial.covariance, T0), r)))
-    if distance > settings.max_prior_sigmas:
-        return (
-            Status.INCONSISTENT,
-            f"the views pull {distance:.1f} sigmas away from the initial pose ({settings.max_prior_sigmas:g} allowed)",
-        )
-    support = solution.data.support
-    if support < wanted_support:
-        return (
-            Status.POOR_FIT,
-            f"{support:.0%} of the components found a partner, expected {wanted_support:.0%} after this start "
-            f"({initial.origin}): possibly a wrong optimum, give a better prior",
-        )
-    if uncertainty > settings.max_uncertainty:
-        return (
-            Status.DEGENERATE,
-            f"a direction stays open: scene points are uncertain by {uncertainty:.1%} of their range "
-            f"({settings.max_uncertainty:.1%} allowed)",
-        )
-    if not solution.converged:
-        return Status.MAX_ITERATIONS, f"still moving after {solution.iterations} steps"
-    return Status.CONVERGED, f"converged in {solution.iterations} steps, {distance:.1f} sigmas from the initial pose"
+def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, config: Config) -> Finding:
+    """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
+    settings, T = config.alignment, solution.T
+    covariance = pose_covariance(solution, known, config.lifting)
+    seen = None
+    if x.frustum is not None and y.frustum is not None:
+        prior = twist_from_ros(covariance, T)
+        seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
+    if seen is not None and settings.brightness > 0:
+        T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)
+    return Finding(solution, T, covariance, overlap(x, y, T, settings), seen)

@@ -107,15 +107,19 @@ class Start(Checked):
 
     method: str = setting(
         "auto",
-        "auto = the given prior, else features, else identity when `identity_fallback`",
+        "auto = the given prior and features together, or the one there is, else identity when `identity_fallback`",
         choices=("auto", "features", "identity"),
+    )
+    features: bool = setting(True, "match features also where a prior is given: they check and sharpen it")
+    max_contradiction: float = setting(
+        5.0, "given prior and features further apart than this are two rivals", unit="sigma", low=1, high=1e6
     )
     max_features: int = setting(2000, "SIFT features per image", low=50, high=20000)
     match_ratio: float = setting(0.8, "ratio test of the feature matches", unit="", low=0.1, high=1)
     ransac_px: float = setting(3.0, "inlier threshold of the pose estimate", unit="px", low=0.1, high=50)
     min_inliers: int = setting(8, "fewer inliers than this is no pose", low=4, high=10000)
     covariance_inflation: float = setting(
-        1.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
+        2.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
     )
     identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
     identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
@@ -132,6 +136,12 @@ class Rung(Checked):
     steps: int = setting(5, "solver steps at most", low=1, high=100_000)
     blur_m: float = setting(
         0.0, "sigma of an isotropic blur of a pair of components, so that far surfaces pull", unit="m", low=0, high=100
+    )
+    outlier_floor: float = setting(
+        0.0, "in place of `alignment.outlier_floor` when above 0; a small one lets far partners pull", low=0, high=10
+    )
+    occlusion_ratio: float = setting(
+        0.0, "in place of `alignment.occlusion_ratio` when above 0; far off, nearly all seems hidden", low=0, high=1000
     )
 
 
@@ -153,6 +163,17 @@ class Alignment(Checked):
         Rung(4.0, 4000, 12, 8),
         Rung(2.0, 8000, 12, 20),
     )
+    search: tuple[Rung, ...] = (Rung(1000.0, 400, 40, 8, 0.3, 1e-4, 100.0),)
+    search_ladder: tuple[Rung, ...] = (
+        Rung(1000.0, 500, 40, 10, 0.08, 1e-4, 100.0),
+        Rung(100.0, 1000, 20, 8, 0.0, 0.0, 100.0),
+        Rung(100.0, 1500, 20, 8),
+        Rung(30.0, 2000, 15, 8),
+        Rung(10.0, 3000, 12, 8),
+        Rung(4.0, 4000, 12, 8),
+        Rung(2.0, 8000, 12, 20),
+    )
+    search_followed: int = setting(4, "how many beginnings of a search are followed to the end", low=1, high=100)
     partner_density: float = setting(
         1.0, "partners kept for each kernel-sized patch of a mixture; at least the rung's components", low=0, high=100
     )
@@ -177,6 +198,12 @@ class Alignment(Checked):
     occlusion_ratio: float = setting(
         0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
     )
+    depth_errors: bool = setting(
+        False, "solve for what each depth map gets wrong as a whole (`lifting.scale_sigma`, `lifting.warp_sigma`)"
+    )
+    brightness: float = setting(
+        0.0, "independent measurements that a point's brightness is worth, 0 = do not sharpen by it", low=0, high=10
+    )
     information: float = setting(
         30.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
     )
@@ -193,6 +220,12 @@ class Alignment(Checked):
     )
     guess_support: float = setting(
         0.8, "smallest share of components that must find a partner when the start was a guess", low=0, high=1
+    )
+    min_correlation: float = setting(
+        0.0, "smallest correlation of the views' brightness under the final pose, where it is known", low=-1, high=1
+    )
+    guess_correlation: float = setting(
+        0.8, "smallest correlation of the views' brightness when the start was a guess", low=-1, high=1
     )
     max_uncertainty: float = setting(
         0.05,
@@ -268,15 +301,16 @@ def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
 
 
 def _monocular() -> Config:
-    """Metric depth from one image: right to a few per cent in scale and shape, so long along each ray."""
+    """Metric depth from one image: right to a few per cent in scale and shape, which are solved for with the pose."""
+    ladder = (Rung(100.0, 1000, 20, 8), Rung(30.0, 1500, 20, 8), Rung(10.0, 2000, 15, 10), Rung(4.0, 3000, 15, 15))
     return Config(
-        lifting=Lifting(noise_floor_m=0.0, noise_linear=0.05, scale_sigma=0.03, warp_sigma=0.02),
+        lifting=Lifting(noise_floor_m=2e-3, noise_linear=0.01, scale_sigma=0.03, warp_sigma=0.02),
         alignment=Alignment(
-            ladder=(Rung(64.0, 1500, 30, 8), Rung(16.0, 2000, 30, 8), Rung(4.0, 3000, 20, 20)),
-            colour_variance=0.01,
-            partner_density=0.25,
-            depth_weight=0.2,
-            information=3.0,
+            ladder=ladder,
+            search_ladder=Alignment().search_ladder[:2] + ladder[1:],
+            depth_errors=True,
+            brightness=0.05,
+            information=5.0,
         ),
     )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial pose, always with a covariance: the given prior, features + metric PnP in both directions, or identity."""
+"""Initial poses, always with a covariance: a given prior and features as two measurements of one pose, or identity."""
 
 from __future__ import annotations
 
@@ -8,33 +8,69 @@ import numpy as np
 from garps_core.config import Config
 from garps_core.errors import InitialisationError
 from garps_core.features import match_features
+from garps_core.geometry import se3_exp, se3_inverse, se3_log
 from garps_core.pnp import pose_from_matches
 from garps_core.types import Prior, View
+from garps_core.uncertainty import ros_from_twist, twist_from_ros
 
 
-def initialise(source: View, target: View, config: Config | None = None, prior: Prior | None = None) -> Prior:
-    """Choose the initial pose and say why (`Prior.origin`, `Prior.reason`).
+def initialise(
+    source: View, target: View, config: Config | None = None, prior: Prior | None = None
+) -> tuple[Prior, ...]:
+    """Initial poses worth aligning from, each saying why (`Prior.origin`, `Prior.reason`).
 
-    "auto" takes the given prior, else features, else identity if `start.identity_fallback`; "features" and
-    "identity" do as they say and ignore a prior.
+    "auto" takes what a given prior and features say together; features alone; a prior alone (also where
+    `start.features` is off); or identity if `start.identity_fallback`. Prior and features that contradict each other
+    are two initial poses: the alignment has to tell which is right. "features" and "identity" do as they say and ignore
+    a prior.
 
     Raises:
         InitialisationError: features fail and identity is not allowed.
     """
     config = config or Config()
     method = config.start.method
-    if method == "auto" and prior is not None:
-        return prior
     if method == "identity":
-        return _identity(config, "asked for by start.method")
+        return (identity(config, "asked for by start.method"),)
+    if method == "auto" and prior is not None and not config.start.features:
+        return (prior,)
     try:
-        return pose_from_matches(match_features(source, target, config.start), source, target, config)
+        found = pose_from_matches(match_features(source, target, config.start), source, target, config)
     except InitialisationError as failure:
+        if method == "auto" and prior is not None:
+            return (prior,)
         if method == "features" or not config.start.identity_fallback:
             raise
-        return _identity(config, f"features failed: {failure}")
+        return (identity(config, f"features failed: {failure}"),)
+    return (found,) if prior is None or method == "features" else combined(prior, found, config.start.max_contradiction)
 
 
-def _identity(config: Config, reason: str) -> Prior:
+def combined(given: Prior, features: Prior, max_contradiction: float) -> tuple[Prior, ...]:
+    """The pose that two measurements agree on, or both of them, features first, when they contradict each other.
+
+    They contradict when their difference, log(T_given T_features^-1), is more than `max_contradiction` sigmas long
+    under the sum of their covariances. Otherwise the difference is shared out by the two covariances (the update of
+    a Kalman filter, linearised at the features' pose, which is the closer one when the prior is vague).
+    """
+    T = features.T_target_source
+    of_given = twist_from_ros(given.covariance, given.T_target_source)
+    of_features = twist_from_ros(features.covariance, T)
+    difference = se3_log(given.T_target_source @ se3_inverse(T))
+    sigmas = float(np.sqrt(difference @ np.linalg.solve(of_given + of_features, difference)))
+    if sigmas > max_contradiction:
+        reason = f"contradicts the {{}}: {sigmas:.1f} sigmas apart ({max_contradiction:g} allowed)"
+        return (
+            Prior(T, features.covariance, features.origin, f"{features.reason}; {reason.format('given prior')}"),
+            Prior(given.T_target_source, given.covariance, given.origin, reason.format("features")),
+        )
+    gain = of_features @ np.linalg.inv(of_given + of_features)
+    T = np.asarray(se3_exp(np.asarray(gain @ difference, np.float64)) @ T, np.float64)
+    left = of_features - gain @ of_features
+    covariance = ros_from_twist(0.5 * (left + left.T), T)
+    reason = f"{features.reason}, {sigmas:.1f} sigmas from the given prior"
+    return (Prior(T, covariance, f"{given.origin} and {features.origin}", reason),)
+
+
+def identity(config: Config, reason: str) -> Prior:
+    """No motion, with the sigmas of `start.identity_sigma_*`: what a guess without any measurement is worth."""
     sigmas = [config.start.identity_sigma_m] * 3 + [config.start.identity_sigma_rad] * 3
     return Prior(np.eye(4), np.diag(np.square(sigmas)), "identity", reason)

@@ -15,15 +15,17 @@ from garps_core.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Frustum:
-    """What the camera behind a mixture could see: image bounds and a coarse depth map.
+    """What the camera behind a mixture could see: image bounds, a coarse depth map and its brightness.
 
     Args:
         K: 3x3 pixels of the depth map's own grid.
         depth: hxw float32 metres, NaN = unknown (then nothing is called hidden there).
+        brightness: hxw float32 0..1 on the same grid; None = not known, then the pose is not sharpened by it.
     """
 
     K: Float64Array
     depth: Float32Array
+    brightness: Float32Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,28 +79,28 @@ class Evaluation:
 
 def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
-    mu, S = _moved(pairs, T)
-    sums = _row_sums(pairs, mu, S)
+    mu, S = moved_rows(pairs, T)
+    sums = row_sums(pairs, mu, S)
     weights, s = pairs.weights.double(), sums[0].double()
     if form == "log":
         value = float((weights * torch.log1p(s)).sum())
         c = weights / (1 + s)
-        return Evaluation(value, *_combine(c, sums, mu, S, weights), float((c * s).sum()))
+        return Evaluation(value, *combine(c, sums, mu, S, weights), float((c * s).sum()))
     total = (weights * s).sum()
     value = float(torch.log(total)) if float(total) > 0 else -np.inf
-    return Evaluation(value, *_combine(weights / total.clamp_min(1e-300), sums, mu, S, None), 1.0)
+    return Evaluation(value, *combine(weights / total.clamp_min(1e-300), sums, mu, S, None), 1.0)
 
 
 def row_information(pairs: Pairs, T: Array) -> tuple[Array, Array]:
     """What each row of the "log" objective measures: (n, 3, 3) sum of r_ij S^-1 times its weight, and (n, 3) mu'."""
-    mu, S = _moved(pairs, T)
-    sums = _row_sums(pairs, mu, S)
+    mu, S = moved_rows(pairs, T)
+    sums = row_sums(pairs, mu, S)
     sums = sums.double()
     Q = sums[4:10] * (pairs.weights.double() / (1 + sums[0]))
     return unpack(Q.T).cpu().numpy(), mu.T.double().cpu().numpy()
 
 
-def _moved(pairs: Pairs, T: Array) -> tuple[Tensor, Tensor]:
+def moved_rows(pairs: Pairs, T: Array) -> tuple[Tensor, Tensor]:
     """Means (3, n) and packed covariances (6, n) of the rows moved by T."""
     like = pairs.means
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3:]))
@@ -117,7 +117,7 @@ def _packed_rotation(R: Array) -> Array:
     return np.stack([[column[i, j] for i, j in SYMMETRIC] for column in columns], axis=1)
 
 
-def _row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
+def row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
     """(16, n) sums over each row's partners: g, g u (3), g S^-1 (6), g u u' (6), in units of the floor."""
     if on_compiled_path(mu):
         parts = (mu, S, pairs.partner_means, pairs.partner_covariances, pairs.log_weights, pairs.log_floor)
@@ -171,7 +171,7 @@ def _chunk_sums(pairs: Pairs, mu: Tensor, S_row: Tensor, rows: slice) -> Tensor:
     return torch.stack([plane.sum(0) for plane in planes])
 
 
-def _combine(c: Tensor, sums: Tensor, mu: Tensor, S: Tensor, weights: Tensor | None) -> tuple[Array, Array, Array]:
+def combine(c: Tensor, sums: Tensor, mu: Tensor, S: Tensor, weights: Tensor | None) -> tuple[Array, Array, Array]:
     """Gradient, Gauss-Newton and observed information from row sums; c (n,) = d objective / d s_i.
 
     J' Q J is quadratic in mu', so it needs only the moments sum Q, sum mu' Q and sum mu' mu'' Q: two small products.

@@ -119,7 +119,7 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
         rows.means,
         own,
         rows.weights / rows.weights.sum(),
-        _log_floor(own, partners, settings.outlier_floor),
+        _log_floor(own, partners, rung.outlier_floor or settings.outlier_floor),
         means,
         covariances,
         log_weights.masked_fill(settings.max_distance_m < distance.T, -torch.inf),

@@ -18,7 +18,8 @@ from garps_core.config import Alignment
 from garps_core.geometry import Array, skew
 from garps_core.objective import Pairs, evaluate
 from garps_core.pairing import Cloud, pair_up, without_floor
-from garps_core.solve import MIN_ROWS, Solution, posterior
+from garps_core.joint import State
+from garps_core.solve import MIN_ROWS, Belief, Solution, posterior
 
 
 def salient(cloud: Cloud, settings: Alignment) -> Cloud:
@@ -74,14 +75,13 @@ def adam_path(pairs: Pairs, T: Array, settings: Alignment, steps: int) -> list[A
     return path
 
 
-def maximise(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, settings: Alignment) -> Solution | None:
-    """The paper's optimisation from T_prior; its curvature plus the prior's makes the covariance (left twist)."""
-    pairs = paper_pairs(source, target, T_prior, settings)
+def maximise(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[Solution]:
+    """The paper's optimisation from the known pose; its curvature plus the prior's makes the covariance."""
+    pairs = paper_pairs(source, target, known.T, settings)
     if pairs is None:
-        return None
+        return []
     rung = settings.ladder[0]
-    T = adam_path(pairs, T_prior, settings, rung.steps)[-1]
+    at = State(adam_path(pairs, known.T, settings, rung.steps)[-1])
     weight = settings.information * rung.covariance_scale
-    precision = np.asarray(np.linalg.inv(covariance), np.float64)
-    end = posterior(evaluate(pairs, T, "sum"), T, T_prior, precision, weight)
-    return Solution(T, end, rung.steps, True, weight, end.data)
+    end = posterior(evaluate(pairs, at.T, "sum"), at, Belief(known.T, known.precision), weight)
+    return [Solution(at, end, rung.steps, True, weight, end.data)]

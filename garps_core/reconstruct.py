@@ -21,6 +21,7 @@ import numpy.typing as npt
 from garps_core.checks import Float32Array
 from garps_core.config import Config, Lifting
 from garps_core.errors import ReconstructionError
+from garps_core.photometric import brightness_of
 from garps_core.types import Frustum, Mixture, View
 
 MIN_COMPONENTS = 50
@@ -221,4 +222,5 @@ def _frustum(view: View, depth: Float32Array) -> Frustum:
     K = view.K.copy()
     K[:2] /= step
     K[:2, 2] -= (step // 2) / step  # grid cell i holds pixel i * step + step // 2
-    return Frustum(K, np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step]))
+    seen = np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step])
+    return Frustum(K, seen, brightness_of(view.rgb, step))

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from garps_core.config import Alignment, Rung
-from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, skew
-from garps_core.objective import Evaluation, Pairs, evaluate, unpack
+from garps_core.geometry import Array, se3_inverse, se3_log, skew
+from garps_core.joint import State, corrected, evaluate_at, two_sided
+from garps_core.objective import Evaluation, Pairs, unpack
 from garps_core.pairing import Cloud, pair_up, thin, visible
 
 _SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
@@ -27,6 +28,8 @@ SMALLEST_CURVATURE = 0.1
 """Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
 FINAL_ROWS, FINAL_NEIGHBOURS, FINAL_DENSITY = 800, 50, 2.0
 """Pairs on which covariance and verdict rest: with few or sparse partners, cut-off kernels look like information."""
+FOOTPRINT_M = 3.2e-3
+"""Typical sigma of a component across its ray: compares a blur, in metres, with a scale."""
 ENTRY_WIDTH = 0.7
 """A rung is skipped when the next one's kernels are still wider than this many times the start's uncertainty."""
 
@@ -45,7 +48,7 @@ class Posterior:
 class Solution:
     """Where the solver stopped."""
 
-    T: Array
+    at: State
     posterior: Posterior
     iterations: int
     converged: bool
@@ -56,20 +59,16 @@ class Solution:
     pairs: tuple[Pairs, Pairs] | None = None
     """What `data` was evaluated on: source rows to target partners, and target rows to source partners."""
 
+    @property
+    def T(self) -> Array:
+        """4x4 pose."""
+        return self.at.T
 
-def two_way(forward: Pairs, backward: Pairs, T: Array) -> Evaluation:
-    """Mean of the "log" objective of source rows moved by T and of target rows moved by T^-1, over T's left twist."""
-    other = _SECOND_DIRECTION.submit(evaluate, backward, se3_inverse(T), "log")
-    f = evaluate(forward, T, "log")
-    b = other.result()
-    A = -adjoint(se3_inverse(T))  # (exp(x) T)^-1 = exp(-Ad(T^-1) x) T^-1
-    return Evaluation(
-        0.5 * (f.value + b.value),
-        0.5 * (f.gradient + A.T @ b.gradient),
-        0.5 * (f.information + A.T @ b.information @ A),
-        0.5 * (f.observed + A.T @ b.observed @ A),
-        0.5 * (f.support + b.support),
-    )
+
+def two_way(forward: Pairs, backward: Pairs, at: State) -> Evaluation:
+    """Mean of the "log" objective of source rows moved by T and of target rows moved by T^-1, over the state's step."""
+    other = _SECOND_DIRECTION.submit(evaluate_at, backward, at, True)
+    return two_sided(evaluate_at(forward, at), other.result(), at.T)
 
 
 BERNOULLI = (1 / 12, -1 / 720, 1 / 30240, -1 / 1209600, 1 / 47900160)
@@ -104,16 +103,33 @@ def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE, open_below
 def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
     """Eigenvalues of the observed in units of the Gauss-Newton information, their directions, and the scaling used."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.information), 1e-12))
-    L = np.linalg.cholesky(data.information * np.outer(scale, scale) + 1e-9 * np.eye(6))
+    floor = 1e-9 * np.eye(len(scale))
+    L = np.linalg.cholesky(data.information * np.outer(scale, scale) + floor)
     inner = np.linalg.solve(L, np.linalg.solve(L, data.observed * np.outer(scale, scale)).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
     return values, L @ vectors, scale
 
 
-def posterior(data: Evaluation, T: Array, T_prior: Array, precision: Array, weight: float) -> Posterior:
-    """Add the prior (precision over the left twist) to `weight` times the data term."""
-    r = se3_log(T @ se3_inverse(T_prior))
-    J = inverse_left_jacobian(r)
+@dataclass(frozen=True)
+class Belief:
+    """What is known beforehand: the pose T, its precision (6, 6) over the left twist, and that of the errors (e,)."""
+
+    T: Array
+    precision: Array
+    error_precision: Array = field(default_factory=lambda: np.zeros(0))
+
+    def joint(self) -> Array:
+        """Precision over all unknowns, (6 + e, 6 + e)."""
+        joint = np.diag(np.concatenate([np.zeros(6), self.error_precision]))
+        joint[:6, :6] = self.precision
+        return joint
+
+
+def posterior(data: Evaluation, at: State, known: Belief, weight: float) -> Posterior:
+    """Add the prior to `weight` times the data term."""
+    r = np.concatenate([se3_log(at.T @ se3_inverse(known.T)), at.errors])
+    J, precision = np.eye(len(r)), known.joint()
+    J[:6, :6] = inverse_left_jacobian(r[:6])
     return Posterior(
         weight * data.value - 0.5 * float(r @ precision @ r),
         weight * data.gradient - J.T @ precision @ r,
@@ -126,32 +142,33 @@ def posterior(data: Evaluation, T: Array, T_prior: Array, precision: Array, weig
 class Climb:
     """Where one rung ended."""
 
-    T: Array
+    at: State
     posterior: Posterior
     iterations: int
     converged: bool
 
 
-def climb(function: Callable[[Array], Posterior], T: Array, steps: int, tolerance: float) -> Climb:
+def climb(function: Callable[[State], Posterior], at: State, steps: int, tolerance: float) -> Climb:
     """Levenberg-damped ascent: at most `steps` evaluations beyond the first, never downhill.
 
     Stops when the undamped step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
     """
-    here = function(T)
+    here = function(at)
+    floor = 1e-12 * np.eye(len(here.gradient))
     damping, used = 1e-3, 0
     while used < steps:
         H = here.information
-        if float(here.gradient @ np.linalg.solve(H + 1e-12 * np.eye(6), here.gradient)) < tolerance**2:
-            return Climb(T, here, used, True)
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(6), here.gradient)
-        there_T = se3_exp(np.asarray(step, np.float64)) @ T
-        there = function(there_T)
+        if float(here.gradient @ np.linalg.solve(H + floor, here.gradient)) < tolerance**2:
+            return Climb(at, here, used, True)
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + floor, here.gradient)
+        candidate = at.moved(np.asarray(step, np.float64))
+        there = function(candidate)
         used += 1
         if there.value >= here.value:
-            T, here, damping = there_T, there, max(damping * 0.2, 1e-6)
+            at, here, damping = candidate, there, max(damping * 0.2, 1e-6)
         else:
             damping = max(damping, 1e-3) * 10
-    return Climb(T, here, used, False)
+    return Climb(at, here, used, False)
 
 
 def rung_pairs(
@@ -165,8 +182,9 @@ def rung_pairs(
     """
     back = se3_inverse(T)
     x, y = _at_resolution(source, rung, density), _at_resolution(target, rung, density)
-    x_seen = x.take(visible(x, T, target.frustum, settings.occlusion_ratio))
-    y_seen = y.take(visible(y, back, source.frustum, settings.occlusion_ratio))
+    hidden_beyond = rung.occlusion_ratio or settings.occlusion_ratio
+    x_seen = x.take(visible(x, T, target.frustum, hidden_beyond))
+    y_seen = y.take(visible(y, back, source.frustum, hidden_beyond))
     x_rows = thin(x_seen, int(np.ceil(len(x_seen) * min(1.0, rung.components / len(x)))))
     y_rows = thin(y_seen, int(np.ceil(len(y_seen) * min(1.0, rung.components / len(y)))))
     if min(len(x_rows), len(y_rows)) < MIN_ROWS:
@@ -201,35 +219,61 @@ def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) 
     return first
 
 
-def anneal(source: Cloud, target: Cloud, T_prior: Array, covariance: Array, settings: Alignment) -> Solution | None:
-    """Run the ladder from the prior's pose; None when a rung finds too few visible components.
+def anneal(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[Solution]:
+    """Run the ladder from what is known beforehand: one solution, none when a rung finds too few visible components."""
+    covariance = np.asarray(np.linalg.inv(known.precision), np.float64)
+    at = State(known.T, np.zeros(len(known.error_precision)))
+    rungs = settings.ladder[entry(source, known.T, covariance, settings.ladder) :]
+    solution = descend(source, target, at, known, rungs, settings)
+    return [] if solution is None else [seen_closely(solution, source, target, settings)]
 
-    Args:
-        source, target: mixtures on the device.
-        T_prior: 4x4 start. covariance: its 6x6, left twist.
-    """
-    precision = np.asarray(np.linalg.inv(covariance), np.float64)
-    T, used = T_prior, 0
-    solution: Solution | None = None
-    for rung in settings.ladder[entry(source, T_prior, covariance, settings.ladder) :]:
-        pairs = rung_pairs(source, target, T, rung, settings, settings.partner_density)
+
+def descend(
+    source: Cloud, target: Cloud, at: State, known: Belief, rungs: tuple[Rung, ...], settings: Alignment
+) -> Solution | None:
+    """Climb on one rung after the other, each on pairs chosen where the last one ended."""
+    used, solution = 0, None
+    for rung in rungs:
+        pairs = pairs_at(source, target, at, rung, settings, settings.partner_density)
         if pairs is None:
             return None
-        weight = settings.information * rung.covariance_scale  # wider kernels anneal, they do not measure less
+        weight = settings.information * worth(rung)
 
-        def function(pose: Array, pairs: tuple[Pairs, Pairs] = pairs, weight: float = weight) -> Posterior:
-            return posterior(two_way(*pairs, pose), pose, T_prior, precision, weight)
+        def function(
+            there: State, pairs: tuple[Pairs, Pairs] = pairs, weight: float = weight, base: State = at
+        ) -> Posterior:
+            return posterior(two_way(*pairs, beyond(there, base)), there, known, weight)
 
-        end = climb(function, T, rung.steps, settings.tolerance)
-        T, used = end.T, used + end.iterations
-        solution = Solution(T, end.posterior, used, end.converged, weight, end.posterior.data)
-    return solution if solution is None else _seen_closely(solution, source, target, settings)
+        end = climb(function, at, rung.steps, settings.tolerance)
+        at, used = end.at, used + end.iterations
+        solution = Solution(at, end.posterior, used, end.converged, weight, end.posterior.data)
+    return solution
 
 
-def _seen_closely(solution: Solution, source: Cloud, target: Cloud, settings: Alignment) -> Solution:
+def beyond(at: State, base: State) -> State:
+    """The state as pairs that are corrected by the errors of `base` see it."""
+    return State(at.T, at.errors - base.errors)
+
+
+def worth(rung: Rung) -> float:
+    """How much a rung's data term counts: wider kernels anneal, they do not measure less."""
+    return max(rung.covariance_scale, (0.5 * rung.blur_m / FOOTPRINT_M) ** 2)
+
+
+def pairs_at(
+    source: Cloud, target: Cloud, at: State, rung: Rung, settings: Alignment, density: float
+) -> tuple[Pairs, Pairs] | None:
+    """`rung_pairs` of the clouds as the state's errors correct them."""
+    half = len(at.errors) // 2
+    x, y = corrected(source, at.errors[:half]), corrected(target, at.errors[half:])
+    return rung_pairs(x, y, at.T, rung, settings, density)
+
+
+def seen_closely(solution: Solution, source: Cloud, target: Cloud, settings: Alignment) -> Solution:
     """The solution with its last rung's data seen again at the final pose, with many partners per row."""
     rung = replace(settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
-    pairs = rung_pairs(source, target, solution.T, rung, settings, FINAL_DENSITY)
+    pairs = pairs_at(source, target, solution.at, rung, settings, FINAL_DENSITY)
     if pairs is None:
         return solution
-    return replace(solution, pairs=pairs, data=two_way(*pairs, solution.T))
+    here = beyond(solution.at, solution.at)
+    return replace(solution, pairs=pairs, data=two_way(*pairs, here), weight=settings.information * worth(rung))

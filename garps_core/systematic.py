@@ -8,31 +8,38 @@ fraction of a pixel. Eight modes of one view stand for them, each a field of dis
           relative depth error; the first is the scale
     6, 7  z times the x and y axes: the direction in which the camera believes a pixel to look, in rad
 
-What one sigma of every mode does to the pose is added to the pose's covariance.
+Depth errors may be solved for together with the pose (`joint.py`). What one sigma of every mode that is not does to
+the pose is added to the pose's covariance.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from garps_core.config import Lifting
 from garps_core.geometry import Array
 
 FIELD_SLOPE = 0.6
 """Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""
-
 LARGEST = 3.0
 """Slopes, in field slopes, beyond which the polynomials are held: no camera's image, but any mixture may be given."""
+DEPTH_MODES = 6
+
+
+def depth_modes(points: Tensor) -> Tensor:
+    """Points (n, 3) m in the camera that measured them -> (n, 6) relative depth error per unit of each depth mode."""
+    z = points[:, 2].clamp_min(1e-6)
+    x, y = ((points[:, axis] / z / FIELD_SLOPE).clamp(-LARGEST, LARGEST) for axis in (0, 1))
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
 def shared_errors(points: Array) -> Array:
     """Points (n, 3) m in the camera that measured them -> (n, 3, 8) displacement per unit of each mode."""
-    z = np.maximum(points[:, 2], 1e-6)
-    x, y = (np.clip(points[:, axis] / z / FIELD_SLOPE, -LARGEST, LARGEST) for axis in (0, 1))
-    depth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     fields = np.zeros((len(points), 3, 8))
-    fields[:, :, :6] = points[:, :, None] * depth[:, None, :]
-    fields[:, 0, 6] = fields[:, 1, 7] = points[:, 2]
+    fields[:, :, :6] = points[:, :, None] * depth_modes(torch.from_numpy(points)).numpy()[:, None, :]
+    fields[:, 0, 6] = fields[:, 1, 7] = np.maximum(points[:, 2], 1e-6)
     return fields
 
 

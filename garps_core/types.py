@@ -106,7 +106,7 @@ class Prior:
     Args:
         T_target_source: 4x4 rigid motion, source-camera points into the target camera, metres.
         covariance: 6x6 in the ROS order and meaning (module docstring), m^2 and rad^2.
-        origin: who made it: "given", "features", "identity".
+        origin: who made it: "given", "features", "given and features", "identity".
         reason: why this one was used, for people.
     Raises:
         InputError: no rigid motion, covariance not positive definite.
@@ -152,6 +152,8 @@ class PoseEstimate:
     iterations: int = 0
     objective: float = float("nan")
     """Final value of the objective; comparable only between runs on the same mixtures and Config."""
+    quality: float = 0.0
+    """How likely the pose is right to 5 cm and 2 deg, 0..1, from its covariance and fit: to gate on and to rank by."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: reconstruct, initialise, align."""
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from garps_core.config import Lifting
 from garps_core.geometry import Array, adjoint, se3_inverse, skew
+from garps_core.joint import State, backward_jacobian
 from garps_core.objective import Pairs, row_information
-from garps_core.solve import Solution, curvature
-from garps_core.systematic import shared_errors, shared_sigmas
+from garps_core.solve import Belief, Solution, curvature
+from garps_core.systematic import DEPTH_MODES, shared_errors, shared_sigmas
 
 OPEN_BELOW = 0.02
 """A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""
@@ -46,44 +47,51 @@ def inverted(covariance: Array, T: Array) -> Array:
     return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)
 
 
-def pose_covariance(solution: Solution, precision: Array, lifting: Lifting) -> Array:
+def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Array:
     """6x6 covariance (ROS meaning) at the solution.
 
-    Inverse of (weighted observed information of the data + precision of the prior), plus what one sigma of every
-    error that all points of a view share does to the optimum.
+    The pose's part of the inverse of (weighted observed information of the data + precision of what was known), plus
+    what one sigma of every shared error that was not solved for does to the optimum.
 
     Args:
         solution: pose, and pairs chosen anew at it with many partners each (few, frozen partners look like curvature).
-        precision: 6x6 inverse covariance of the prior, left twist.
+        known: the prior of pose and depth errors.
         lifting: sigmas of the shared errors.
     """
-    data, weight = solution.data, solution.weight
+    data, weight, precision = solution.data, solution.weight, known.joint()
     covariance = np.linalg.inv(weight * curvature(data, OPEN_DIRECTION, OPEN_BELOW) + precision)
     if solution.pairs is not None:
+        sigmas = shared_sigmas(lifting)
+        if len(known.error_precision):
+            sigmas[:DEPTH_MODES] = 0.0
         held = np.linalg.inv(weight * data.information + precision)
-        for pull in shared_pull(*solution.pairs, solution.T):
-            effect = held @ (weight * pull) * shared_sigmas(lifting)
+        for pull in shared_pull(*solution.pairs, solution.at):
+            effect = held @ (weight * pull) * sigmas
             covariance += effect @ effect.T
-    return ros_from_twist(0.5 * (covariance + covariance.T), solution.T)
+    of_pose = covariance[:6, :6]
+    return ros_from_twist(0.5 * (of_pose + of_pose.T), solution.T)
 
 
-def shared_pull(forward: Pairs, backward: Pairs, T: Array) -> tuple[Array, Array]:
+def shared_pull(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:
     """What each shared error of the source's, and of the target's, points adds to the gradient of `two_way`.
 
     Partners are held, as in the Gauss-Newton information: -J' Q dd for a displacement dd of rows minus partners.
 
     Returns:
-        Two (6, 8) arrays over the left twist of T, per unit of each mode.
+        Two (6 + errors, 8) arrays over the unknowns of `at`, per unit of each mode.
     """
-    A = -adjoint(se3_inverse(T))
-    rows_f, partners_f = _one_way_pull(forward, T)
-    rows_b, partners_b = _one_way_pull(backward, se3_inverse(T))
-    return 0.5 * (rows_f + A.T @ partners_b), 0.5 * (partners_f + A.T @ rows_b)
+    B = backward_jacobian(at.T, len(at.errors))
+    rows_f, partners_f = _one_way_pull(forward, at.T, len(at.errors))
+    rows_b, partners_b = _one_way_pull(backward, se3_inverse(at.T), len(at.errors))
+    return 0.5 * (rows_f + B.T @ partners_b), 0.5 * (partners_f + B.T @ rows_b)
 
 
-def _one_way_pull(pairs: Pairs, T: Array) -> tuple[Array, Array]:
+def _one_way_pull(pairs: Pairs, T: Array, errors: int) -> tuple[Array, Array]:
     Q, moved = row_information(pairs, T)
-    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), -np.stack([skew(p) for p in moved])], axis=2)
-    JQ = J.transpose(0, 2, 1) @ Q
     rows = T[:3, :3] @ shared_errors(pairs.means.double().cpu().numpy())
-    return -(JQ @ rows).sum(0), (JQ @ shared_errors(moved)).sum(0)
+    partners = shared_errors(moved)
+    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), -np.stack([skew(p) for p in moved])], axis=2)
+    if errors:
+        J = np.concatenate([J, rows[:, :, :DEPTH_MODES], -partners[:, :, :DEPTH_MODES]], axis=2)
+    JQ = J.transpose(0, 2, 1) @ Q
+    return -(JQ @ rows).sum(0), (JQ @ partners).sum(0)

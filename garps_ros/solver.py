@@ -167,7 +167,7 @@ class Solver:
             found = estimate_relative_pose(source, target, self._job.config, self._prior)
         self._result.core_s += time.perf_counter() - began
         if self._prior is not None:
-            given = found.initial is not None and found.initial.origin == "given"
+            given = found.initial is not None and found.initial.origin.startswith("given")
             self._result.prior = "used" if given else f"not used: start.method is {self._job.config.start.method}"
         self._seen = source, target, found
         return found

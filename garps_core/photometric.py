@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sharpen a pose by brightness: what one camera measured in 3D, the other must see equally bright where it projects.
+
+No features and no correspondences are needed, and depth errors hardly matter: a point whose depth is off by a few per
+cent moves in the other image by that share of the parallax only, not of the depth. The basin is small, a few pixels of
+the coarsest grid, so this comes after the mixtures are aligned, whose result is the prior:
+
+    minimise  information / 2 * sum rho((I_y(pi(T p)) - gain I_x(p) - offset) / sigma)  +  r' Lambda r / 2
+
+Both directions count. Gain and offset absorb the exposure, sigma is the residuals' own spread, rho is Tukey's
+biweight. (Direct alignment as in Steinbruecker et al. 2011 and Kerl et al. 2013, between two whole views.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from garps_core.checks import Float32Array
+from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
+from garps_core.mixture import Frustum
+from garps_core.systematic import shared_errors
+
+GRIDS = (8, 4, 2, 1)
+"""Every n-th cell of the frustum's grid, coarse to fine: a basin of some pixels of the first."""
+STEPS = 6
+MAX_POINTS = 6000
+"""Points per direction, those with the strongest gradients."""
+MIN_POINTS = 100
+EDGE_RATIO = 0.12
+"""Points whose neighbours' depths differ by more than this share may belong to either side of an edge."""
+HIDDEN_RATIO = 0.15
+"""Points whose depth differs by more than this share from what the other camera sees there are not the same surface."""
+TUKEY = 4.0
+SMALLEST_SIGMA = 2e-3
+"""Share of full brightness; 8-bit images are not more precise."""
+
+
+@dataclass(frozen=True)
+class Sharpened:
+    """Pose T (4x4) and its covariance (6x6, left twist), and how well brightness agrees there."""
+
+    T: Array
+    covariance: Array
+    correlation: float
+    """Of the brightness of points and of the pixels they fall on, -1..1, the smaller of both directions."""
+    share: float
+    """Share (0..1) of the points that the other camera sees, the smaller of both directions."""
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """One resolution of a view: image, its slopes, depth and intrinsics; and points (n, 3) m with their brightness."""
+
+    image: Float32Array
+    slope_x: Float32Array
+    slope_y: Float32Array
+    depth: Float32Array
+    K: Array
+    points: Array
+    brightness: Array
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Normal equations of one direction over the left twist of the pose that moves its points."""
+
+    information: Array
+    gradient: Array
+    of_depth: Array
+    """(6, 8) gradient per unit of each error that the points may share (`systematic.py`)."""
+    correlation: float
+    share: float
+
+
+def sharpen(
+    source: Frustum, target: Frustum, T: Array, covariance: Array, information: float, sigmas: Array
+) -> Sharpened | None:
+    """The pose where brightness and the prior agree best; None where too little is seen, or a view has no brightness.
+
+    Args:
+        source, target: what the two cameras saw.
+        T: 4x4 prior. covariance: its 6x6, left twist.
+        information: independent measurements per point of the finest grid; 0 = only compare, at T.
+        sigmas: (8,) of the errors that a view's points share; what they do to the pose is added to its covariance.
+    """
+    if source.brightness is None or target.brightness is None:
+        return None
+    precision, at = np.linalg.inv(covariance), T
+    for step in GRIDS if information > 0 else GRIDS[-1:]:
+        x, y = _grid(source, step), _grid(target, step)
+        for _ in range(STEPS if information > 0 else 0):
+            seen = _both(x, y, at)
+            if seen is None:
+                break
+            weight = 0.5 * information * step**2
+            r = se3_log(at @ se3_inverse(T))
+            H, g = _summed(*seen, at)
+            move = np.linalg.solve(weight * H + precision, weight * g - precision @ r)
+            at = np.asarray(se3_exp(np.asarray(move, np.float64)) @ at)
+    seen = _both(x, y, at)
+    if seen is None:
+        return None
+    f, b = seen
+    weight = 0.5 * information
+    held = np.linalg.inv(weight * _summed(f, b, at)[0] + precision)
+    B, spread = -adjoint(se3_inverse(at)), held.copy()
+    for pull in (f.of_depth, B.T @ b.of_depth):
+        effect = held @ (weight * pull) * sigmas
+        spread += effect @ effect.T
+    agreement = min(f.correlation, b.correlation), min(f.share, b.share)
+    return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement)
+
+
+def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:
+    """HxWx3 uint8 -> grey 0..1 at every step-th pixel, low-passed to that spacing."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    smooth = cv2.GaussianBlur(grey, (0, 0), 0.5 * step)
+    return np.ascontiguousarray(smooth[step // 2 :: step, step // 2 :: step]).astype(np.float32) / np.float32(255)
+
+
+def _grid(view: Frustum, step: int) -> _Grid:
+    assert view.brightness is not None  # noqa: S101 - `sharpen` has looked
+    image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
+    image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step])
+    depth = view.depth[step // 2 :: step, step // 2 :: step]
+    K = view.K.copy()
+    K[:2] /= step
+    K[:2, 2] -= (step // 2) / step
+    slope_x, slope_y = (cv2.Scharr(image, cv2.CV_32F, dx, 1 - dx) / np.float32(32) for dx in (1, 0))
+    v, u = np.nonzero(_on_one_surface(depth))
+    strength = np.hypot(slope_x, slope_y)[v, u]
+    if len(u) > MAX_POINTS:
+        strongest = np.sort(np.argpartition(-strength, MAX_POINTS)[:MAX_POINTS])
+        u, v = u[strongest], v[strongest]
+    points = pixel_rays(K, u.astype(float), v.astype(float)) * depth[v, u].astype(float)[:, None]
+    return _Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float))
+
+
+def _on_one_surface(depth: Float32Array) -> npt.NDArray[np.bool_]:
+    there, kernel = np.isfinite(depth), np.ones((3, 3), np.uint8)
+    far = cv2.dilate(np.where(there, depth, np.float32(0)), kernel)
+    near = cv2.erode(np.where(there, depth, np.float32(1e6)), kernel)
+    return np.asarray(there & (far - near < EDGE_RATIO * near))
+
+
+def _both(x: _Grid, y: _Grid, T: Array) -> tuple[_Comparison, _Comparison] | None:
+    f = _compared(x, y, T)
+    b = None if f is None else _compared(y, x, se3_inverse(T))
+    return None if f is None or b is None else (f, b)
+
+
+def _summed(f: _Comparison, b: _Comparison, T: Array) -> tuple[Array, Array]:
+    """Information and gradient of both directions over the left twist of T."""
+    B = -adjoint(se3_inverse(T))
+    return f.information + B.T @ b.information @ B, f.gradient + B.T @ b.gradient
+
+
+def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
+    """Points of x against the pixels of y that they fall on; None when too few do."""
+    moved = x.points @ T[:3, :3].T + T[:3, 3]
+    pixel = _seen_at(moved, y)
+    inside = np.isfinite(pixel[:, 0])
+    if inside.sum() < MIN_POINTS:
+        return None
+    moved, (u, v) = moved[inside], pixel[inside].T
+    theirs, slope_x, slope_y = (_sampled(image, u, v) for image in (y.image, y.slope_x, y.slope_y))
+    own = x.brightness[inside]
+    exposure = np.stack([own, np.ones_like(own)], axis=1)
+    error, weights = _robust(theirs, exposure)
+    z = moved[:, 2]
+    a, b = slope_x * y.K[0, 0] / z, slope_y * y.K[1, 1] / z
+    slope = np.stack([a, b, -(a * moved[:, 0] + b * moved[:, 1]) / z], axis=1)  # brightness per metre
+    J = np.concatenate([slope, np.cross(moved, slope)], axis=1)
+    weighted = exposure * weights[:, None]
+    J = J - exposure @ np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ J)  # exposure is free
+    JW = (J * weights[:, None]).T
+    fields = T[:3, :3] @ shared_errors(x.points[inside])
+    of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
+    spread = float(np.std(own) * np.std(theirs))
+    correlation = float(np.mean((own - own.mean()) * (theirs - theirs.mean()))) / max(spread, 1e-9)
+    return _Comparison(JW @ J, -JW @ error, of_depth, correlation, float(inside.mean()))
+
+
+def _seen_at(moved: Array, y: _Grid) -> Array:
+    """Pixels (n, 2) of y on which points (n, 3) fall; NaN outside, and where y's camera sees another surface."""
+    height, width = y.image.shape
+    z = np.maximum(moved[:, 2], 1e-3)
+    u, v = (moved[:, axis] / z * y.K[axis, axis] + y.K[axis, 2] for axis in (0, 1))
+    inside = (moved[:, 2] > 0.05) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
+    surface = np.full(len(z), np.nan)
+    surface[inside] = y.depth[np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)]
+    with np.errstate(invalid="ignore"):
+        inside &= ~(np.abs(z - surface) > HIDDEN_RATIO * surface)  # kept where the depth is unknown
+    return np.where(inside[:, None], np.stack([u, v], axis=1), np.nan)
+
+
+def _sampled(image: Float32Array, u: Array, v: Array) -> Array:
+    at = (part.astype(np.float32).reshape(1, -1) for part in (u, v))
+    return np.asarray(cv2.remap(image, *at, cv2.INTER_LINEAR)[0], np.float64)
+
+
+def _robust(theirs: Array, exposure: Array) -> tuple[Array, Array]:
+    """Residuals after the best gain and offset, and Tukey's weights over the residuals' own variance."""
+    weights = np.ones(len(theirs))
+    for _ in range(3):
+        weighted = exposure * weights[:, None]
+        fit = np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ theirs)
+        error = theirs - exposure @ fit
+        sigma = max(1.4826 * float(np.median(np.abs(error))), SMALLEST_SIGMA)
+        weights = np.square(np.maximum(1 - np.square(error / (TUKEY * sigma)), 0))
+    return error, weights / sigma**2
