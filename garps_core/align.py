@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from garps_core import paper, solve
-from garps_core.config import Config
+from garps_core.config import Alignment, Config
 from garps_core.errors import InitialisationError, InputError
 from garps_core.initialise import identity, initialise
 from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
@@ -134,12 +134,10 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     findings = [_finding(solution, x, y, known, config) for solution in maximise(x, y, known, settings)]
     if not findings:
         shared = overlap(x, y, known.T, settings)
-        reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
-        return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
+        return _too_little(shared, initial, settings)
     best = max(findings, key=lambda finding: finding.merit)
     if best.overlap < settings.min_overlap:
-        reason = f"the views share {best.overlap:.0%} of their components, expected at least {settings.min_overlap:.0%}"
-        return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=best.overlap)
+        return _too_little(best.overlap, initial, settings)
     uncertainty = relative_uncertainty(source, best.T, best.covariance)
     status, reason = verdict(best, initial, guess, uncertainty, settings)
     return PoseEstimate(
@@ -153,6 +151,13 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         best.solution.data.value,
         quality(best, guess),
     )
+
+
+def _too_little(shared: float, initial: Prior, settings: Alignment) -> PoseEstimate:
+    reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
+    if shared >= settings.min_overlap:  # then the solver gave up
+        reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
+    return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
 
 
 def _known(initial: Prior, config: Config) -> Belief:

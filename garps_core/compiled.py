@@ -33,11 +33,10 @@ ROWS = 128
 """Rows handled at a time: the scratch of 36 planes stays in a core's first-level cache."""
 FINITE_MATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 """Liberties the compiler may take; not the one that forgets infinities, which mean "no partner"."""
-PER_CELL = 2.0
-"""Partners in a cell of the neighbour search's image grid, on average."""
 
 
-def _loop(function: Loop) -> Loop:
+def loop(function: Loop) -> Loop:
+    """`function` compiled, or as it is where there is no numba."""
     if numba is None:
         return function
     options: dict[str, Any] = {"nogil": True, "fastmath": FINITE_MATH, "error_model": "numpy"}
@@ -48,8 +47,8 @@ def _loop(function: Loop) -> Loop:
     return compiled  # type: ignore[no-any-return]
 
 
-@_loop
-def _exp(x: np.float32) -> np.float32:
+@loop
+def exponential(x: np.float32) -> np.float32:
     """e^x for -80 < x < 80, relative error 2e-7: 2^n times a polynomial (Cephes expf)."""
     n = np.int32(np.int32(x * np.float32(1.44269504) + np.float32(256.5)) - np.int32(256))
     whole = np.float32(n)
@@ -61,10 +60,10 @@ def _exp(x: np.float32) -> np.float32:
     p = p * r + np.float32(1.6666665459e-1)
     p = p * r + np.float32(5.0000001201e-1)
     p = p * r * r + r + np.float32(1)
-    return p * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)  # type: ignore[no-any-return]
+    return p * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
-@_loop
+@loop
 def row_sums(
     mu: Float32, S: Float32, partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32
 ) -> Float32:
@@ -103,7 +102,7 @@ def row_sums(
     return out
 
 
-@_loop
+@loop
 def _add_partner(w: Float32, total: Float32, rows: int) -> None:
     """Add one partner of each row to the sums; the formulas of `objective._chunk_sums`, in its order."""
     one, left = np.float32(1), np.float32(1.1920929e-07)
@@ -130,7 +129,7 @@ def _add_partner(w: Float32, total: Float32, rows: int) -> None:
         u2 = p2 * d0 + p4 * d1 + p5 * d2
         D = d0 * u0 + d1 * u1 + d2 * u2
         exponent = min(max(w[19 * ROWS + r] - np.float32(0.5) * D, np.float32(-60)), np.float32(80))
-        g = _exp(exponent) / (np.sqrt(a) * np.sqrt(second) * np.sqrt(third))
+        g = exponential(exponent) / (np.sqrt(a) * np.sqrt(second) * np.sqrt(third))
         g0, g1, g2 = g * u0, g * u1, g * u2
         total[r] += g
         total[ROWS + r] += g0
@@ -150,7 +149,7 @@ def _add_partner(w: Float32, total: Float32, rows: int) -> None:
         total[15 * ROWS + r] += g2 * u2
 
 
-@_loop
+@loop
 def moments(c: Float64, missing: Float64, sums: Float32, mu: Float32, S: Float32) -> tuple[Float64, Float64]:
     """(10, 15) moments and (6, 6) turning of `objective._combine`.
 
@@ -195,7 +194,7 @@ def moments(c: Float64, missing: Float64, sums: Float32, mu: Float32, S: Float32
     return out, turning
 
 
-@_loop
+@loop
 def gathered(
     index: Int64, means: Float32, covariances: Float32, log_weights: Float32, colours: Float32, row_colours: Float32,
     per_colour: float,
@@ -219,7 +218,7 @@ def gathered(
     return y, S, weights
 
 
-@_loop
+@loop
 def seen(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ratio: float) -> npt.NDArray[np.bool_]:
     """Mask (n,) of points (n, 3) that the other camera sees (`pairing.visible`)."""
     height, width = depth.shape
@@ -234,108 +233,3 @@ def seen(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ra
             if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
                 mask[i] = not (forward > depth[int(np.rint(v)), int(np.rint(u))] * reach)
     return mask
-
-
-@_loop
-def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tuple[Int64, Float32]:
-    """The k nearest partners of each row, exact: indices (n, k) by distance, and distances (n, k).
-
-    rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Distances in metres, or in
-    `pairing.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
-    around a row's pixel are searched until no unseen cell can hold a nearer one: whatever lies beyond a line x = a z
-    of the image is at least |x - a z| / sqrt(1 + a^2) away.
-    """
-    n, m, in_image = len(rows), len(partners), depth_weight < 1
-    slopes = np.empty((m, 2), np.float32)
-    for i in range(m):
-        for axis in range(2):
-            slopes[i, axis] = partners[i, axis] / partners[i, 2]
-    low_x, low_y = slopes[:, 0].min(), slopes[:, 1].min()
-    span_x, span_y = slopes[:, 0].max() - low_x + 1e-6, slopes[:, 1].max() - low_y + 1e-6
-    cell = np.sqrt(span_x * span_y * PER_CELL / m)
-    cell = max(cell, span_x / 1024, span_y / 1024)
-    across, down = int(span_x / cell) + 1, int(span_y / cell) + 1
-    first, order = _sorted_into_cells(slopes, low_x, low_y, cell, across, down)
-    points = np.empty((m, 3), np.float32)
-    for i in range(m):
-        p = partners[order[i]]
-        if in_image:
-            points[i, 0], points[i, 1] = p[0] / p[2], p[1] / p[2]
-            points[i, 2] = depth_weight * np.log(p[2])
-        else:
-            points[i, 0], points[i, 1], points[i, 2] = p[0], p[1], p[2]
-    index, distance = np.empty((n, k), np.int64), np.empty((n, k), np.float32)
-    best, where = np.empty(k, np.float32), np.empty(k, np.int64)
-    for i in range(n):
-        x, y, z = rows[i, 0], rows[i, 1], rows[i, 2]
-        safe = max(z, np.float32(1e-3))
-        sx, sy = x / safe, y / safe
-        q0, q1, q2 = x, y, z
-        if in_image:
-            q0, q1, q2 = sx, sy, np.float32(depth_weight * np.log(safe))
-        column = min(max(int((sx - low_x) / cell), 0), across - 1)
-        row = min(max(int((sy - low_y) / cell), 0), down - 1)
-        best[:] = np.inf
-        where[:] = 0
-        ring = 0
-        while True:
-            for v in range(max(row - ring, 0), min(row + ring, down - 1) + 1):
-                step = 1 if abs(v - row) == ring else max(2 * ring, 1)
-                for u in range(column - ring, column + ring + 1, step):
-                    if u < 0 or u >= across:
-                        continue
-                    for p in range(first[v * across + u], first[v * across + u + 1]):
-                        d0, d1, d2 = points[p, 0] - q0, points[p, 1] - q1, points[p, 2] - q2
-                        d = d0 * d0 + d1 * d1 + d2 * d2
-                        if d < best[k - 1]:
-                            place = k - 1
-                            while place > 0 and best[place - 1] > d:
-                                best[place], where[place] = best[place - 1], where[place - 1]
-                                place -= 1
-                            best[place], where[place] = d, p
-            left, right = low_x + (column - ring) * cell, low_x + (column + ring + 1) * cell
-            top, bottom = low_y + (row - ring) * cell, low_y + (row + ring + 1) * cell
-            bound = np.inf
-            if column - ring > 0:
-                bound = min(bound, _beyond(sx - left, left, z, in_image))
-            if column + ring + 1 < across:
-                bound = min(bound, _beyond(right - sx, right, z, in_image))
-            if row - ring > 0:
-                bound = min(bound, _beyond(sy - top, top, z, in_image))
-            if row + ring + 1 < down:
-                bound = min(bound, _beyond(bottom - sy, bottom, z, in_image))
-            if bound == np.inf or bound * bound > best[k - 1]:
-                break
-            ring += 1
-        for j in range(k):
-            index[i, j], distance[i, j] = order[where[j]], np.sqrt(best[j])
-    return index, distance
-
-
-@_loop
-def _beyond(gap: float, line: float, z: float, in_image: bool) -> float:
-    """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when nothing is known."""
-    if gap <= 0 or z <= 1e-3:
-        return 0.0
-    return gap if in_image else gap * z / np.sqrt(1 + line * line)
-
-
-@_loop
-def _sorted_into_cells(
-    slopes: Float32, low_x: float, low_y: float, cell: float, across: int, down: int
-) -> tuple[Int64, Int64]:
-    """First position of every cell (cells + 1,), and the partners in order of their cells (m,)."""
-    m = len(slopes)
-    of, first = np.empty(m, np.int64), np.zeros(across * down + 1, np.int64)
-    for i in range(m):
-        u = min(int((slopes[i, 0] - low_x) / cell), across - 1)
-        v = min(int((slopes[i, 1] - low_y) / cell), down - 1)
-        of[i] = v * across + u
-        first[of[i] + 1] += 1
-    for i in range(across * down):
-        first[i + 1] += first[i]
-    place, order = first.copy(), np.empty(m, np.int64)
-    for i in range(m):
-        order[place[of[i]]] = i
-        place[of[i]] += 1
-    return first, order

@@ -9,66 +9,11 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any
 
+from garps_core.described import Checked, setting
 from garps_core.errors import ConfigError
-
-
-def setting(
-    default: Any,
-    doc: str,
-    *,
-    unit: str = "",
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = True,
-) -> Any:
-    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated.
-
-    `live` = it may be changed while a node runs.
-    """
-    described = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
-    return field(default=default, metadata=described)
-
-
-_KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
-
-
-class Checked:
-    """Base of a settings dataclass: checks every field against its own description, raises ConfigError.
-
-    Errors name a field with `prefix` before it: by default the class in lower case and a dot.
-    """
-
-    _prefix: ClassVar[str]
-
-    def __init_subclass__(cls, prefix: str | None = None) -> None:
-        super().__init_subclass__()
-        cls._prefix = f"{cls.__name__.lower()}." if prefix is None else prefix
-
-    def __post_init__(self) -> None:
-        for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, limits = getattr(self, f.name), f.metadata
-            name = self._prefix + f.name
-            if limits.get("choices") and value not in limits["choices"]:
-                raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
-            if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
-                _check_number(name, value, f.default, limits)
-            elif not isinstance(value, type(f.default)):
-                raise ConfigError(
-                    f"{name} is {value!r:.100}: expected {_KINDS.get(type(f.default), type(f.default).__name__)}"
-                )
-
-
-def _check_number(name: str, value: Any, default: float, limits: Mapping[str, Any]) -> None:
-    kinds = (int,) if isinstance(default, int) else (int, float)
-    if not isinstance(value, kinds) or isinstance(value, bool):
-        raise ConfigError(f"{name} is {value!r}: expected {'an integer' if kinds == (int,) else 'a number'}")
-    low, high = limits.get("low"), limits.get("high")
-    if not (value == value and (low is None or value >= low) and (high is None or value <= high)):
-        raise ConfigError(f"{name} is {value}: expected between {low} and {high} {limits.get('unit', '')}".rstrip())
 
 
 @dataclass(frozen=True)

@@ -59,12 +59,14 @@ def evaluate_jointly(pairs: Pairs, T: Array, of_rows: Array, of_partners: Array)
     """
     own = pairs.means.double()
     rows_modes = depth_modes(own)
-    like = {"dtype": own.dtype, "device": own.device}
-    R, t = torch.as_tensor(T[:3, :3], **like), torch.as_tensor(T[:3, 3], **like)
-    arm = (own * (1 + rows_modes @ torch.as_tensor(of_rows, **like))[:, None]) @ R.T
+    R, t, by_rows, by_partners = (
+        torch.as_tensor(part, dtype=own.dtype, device=own.device)
+        for part in (T[:3, :3], T[:3, 3], of_rows, of_partners)
+    )
+    arm = (own * (1 + rows_modes @ by_rows)[:, None]) @ R.T
     there = arm + t
     partner_modes = depth_modes(there)
-    mu = there * (1 - partner_modes @ torch.as_tensor(of_partners, **like))[:, None]
+    mu = there * (1 - partner_modes @ by_partners)[:, None]
     _, S = moved_rows(pairs, T)
     packed = mu.T.to(S.dtype).contiguous()
     sums = row_sums(pairs, packed, S)

@@ -120,8 +120,8 @@ def _packed_rotation(R: Array) -> Array:
 def row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
     """(16, n) sums over each row's partners: g, g u (3), g S^-1 (6), g u u' (6), in units of the floor."""
     if on_compiled_path(mu):
-        parts = (mu, S, pairs.partner_means, pairs.partner_covariances, pairs.log_weights, pairs.log_floor)
-        return torch.from_numpy(compiled.row_sums(*(part.contiguous().numpy() for part in parts)))
+        own, partners = (mu, S), (pairs.partner_means, pairs.partner_covariances, pairs.log_weights, pairs.log_floor)
+        return torch.from_numpy(compiled.row_sums(*(part.contiguous().numpy() for part in own + partners)))
     n, k = len(pairs.means), pairs.log_weights.shape[0]
     chunk = max(1, (CHUNK_PAIRS_CUDA if mu.is_cuda else CHUNK_PAIRS) // max(k, 1))
     parts = [_chunk_sums(pairs, mu, S, slice(begin, begin + chunk)) for begin in range(0, n, chunk)]

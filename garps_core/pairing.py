@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from garps_core import compiled
+from garps_core import compiled, neighbours
 from garps_core.config import Alignment, Config, Rung
 from garps_core.errors import ConfigError
 from garps_core.geometry import Array, se3_inverse
@@ -87,8 +87,8 @@ def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: floa
     K = torch.as_tensor(other.K, dtype=like.dtype, device=like.device)
     depth = torch.as_tensor(other.depth, dtype=like.dtype, device=like.device)
     if on_compiled_path(like):
-        mask = compiled.seen(*(part.contiguous().numpy() for part in (like, R, t, K, depth)), occlusion_ratio)
-        return torch.from_numpy(mask)
+        points, turn, shift, camera, map_ = (part.contiguous().numpy() for part in (like, R, t, K, depth))
+        return torch.from_numpy(compiled.seen(points, turn, shift, camera, map_, occlusion_ratio))
     height, width = depth.shape
     p = like @ R.T + t
     z = p[:, 2].clamp_min(1e-6)
@@ -127,7 +127,7 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
 
 
 def widened(covariances: Tensor, rung: Rung) -> Tensor:
-    """Packed covariances (n, 6) as a rung sees them: scaled, and blurred by half of `blur_m` squared in all directions."""
+    """Packed covariances (n, 6) as a rung sees them: scaled, and blurred in all directions by half of `blur_m`'s."""
     wider = covariances * rung.covariance_scale
     wider[:, [0, 3, 5]] += 0.5 * rung.blur_m**2
     return wider
@@ -143,11 +143,14 @@ def _gathered(
     covariances = widened(partners.covariances, rung)
     log_weights, per_colour = torch.log(partners.weights.clamp_min(1e-30)), 0.25 / settings.colour_variance
     if on_compiled_path(rows.means):
-        parts = (index, partners.means, covariances, log_weights, partners.colours, rows.colours)
-        found = compiled.gathered(*(part.contiguous().numpy() for part in parts), per_colour)
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2])
+        means, packed, weights, colours, own = (
+            part.contiguous().numpy()
+            for part in (partners.means, covariances, log_weights, partners.colours, rows.colours)
+        )
+        y, S, w = compiled.gathered(index.numpy(), means, packed, weights, colours, own, per_colour)
+        return torch.from_numpy(y), torch.from_numpy(S), torch.from_numpy(w)
     chosen = index.T.contiguous()
-    cost = sum((rows.colours[:, c][None] - partners.colours[:, c][chosen]) ** 2 for c in range(3))
+    cost = torch.stack([(rows.colours[:, c][None] - partners.colours[:, c][chosen]) ** 2 for c in range(3)]).sum(0)
     return (
         partners.means.T[:, chosen].contiguous(),
         covariances.T[:, chosen].contiguous(),
@@ -162,7 +165,7 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     moved = like @ R.T + t
     them = partners.means
     if on_compiled_path(like) and len(them) and float(them[:, 2].min()) > NEAREST_Z_M:
-        index, distance = compiled.nearest(moved.numpy(), them.contiguous().numpy(), k, depth_weight)
+        index, distance = neighbours.nearest(moved.numpy(), them.contiguous().numpy(), k, depth_weight)
         return torch.from_numpy(index), torch.from_numpy(distance)
     if depth_weight < 1:
         moved, them = image_coordinates(moved, depth_weight), image_coordinates(them, depth_weight)

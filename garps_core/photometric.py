@@ -34,6 +34,8 @@ EDGE_RATIO = 0.12
 """Points whose neighbours' depths differ by more than this share may belong to either side of an edge."""
 HIDDEN_RATIO = 0.15
 """Points whose depth differs by more than this share from what the other camera sees there are not the same surface."""
+MIN_CONTRAST = 0.02
+"""Standard deviation of the brightness (of 0..1) below which there is nothing to compare."""
 TUKEY = 4.0
 SMALLEST_SIGMA = 2e-3
 """Share of full brightness; 8-bit images are not more precise."""
@@ -125,7 +127,7 @@ def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:
 def _grid(view: Frustum, step: int) -> _Grid:
     assert view.brightness is not None  # noqa: S101 - `sharpen` has looked
     image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
-    image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step])
+    image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step], np.float32)
     depth = view.depth[step // 2 :: step, step // 2 :: step]
     K = view.K.copy()
     K[:2] /= step
@@ -160,7 +162,7 @@ def _summed(f: _Comparison, b: _Comparison, T: Array) -> tuple[Array, Array]:
 
 
 def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
-    """Points of x against the pixels of y that they fall on; None when too few do."""
+    """Points of x against the pixels of y that they fall on; None when too few do, or all look alike."""
     moved = x.points @ T[:3, :3].T + T[:3, 3]
     pixel = _seen_at(moved, y)
     inside = np.isfinite(pixel[:, 0])
@@ -169,6 +171,8 @@ def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
     moved, (u, v) = moved[inside], pixel[inside].T
     theirs, slope_x, slope_y = (_sampled(image, u, v) for image in (y.image, y.slope_x, y.slope_y))
     own = x.brightness[inside]
+    if min(np.std(own), np.std(theirs)) < MIN_CONTRAST:
+        return None
     exposure = np.stack([own, np.ones_like(own)], axis=1)
     error, weights = _robust(theirs, exposure)
     z = moved[:, 2]
@@ -180,8 +184,7 @@ def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
     JW = (J * weights[:, None]).T
     fields = T[:3, :3] @ shared_errors(x.points[inside])
     of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
-    spread = float(np.std(own) * np.std(theirs))
-    correlation = float(np.mean((own - own.mean()) * (theirs - theirs.mean()))) / max(spread, 1e-9)
+    correlation = float(np.corrcoef(own, theirs)[0, 1])
     return _Comparison(JW @ J, -JW @ error, of_depth, correlation, float(inside.mean()))
 
 
@@ -199,8 +202,8 @@ def _seen_at(moved: Array, y: _Grid) -> Array:
 
 
 def _sampled(image: Float32Array, u: Array, v: Array) -> Array:
-    at = (part.astype(np.float32).reshape(1, -1) for part in (u, v))
-    return np.asarray(cv2.remap(image, *at, cv2.INTER_LINEAR)[0], np.float64)
+    columns, rows = u.astype(np.float32)[None], v.astype(np.float32)[None]
+    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR)[0], np.float64)
 
 
 def _robust(theirs: Array, exposure: Array) -> tuple[Array, Array]:

@@ -103,7 +103,7 @@ def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE, open_below
 def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
     """Eigenvalues of the observed in units of the Gauss-Newton information, their directions, and the scaling used."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.information), 1e-12))
-    floor = 1e-9 * np.eye(len(scale))
+    floor = (1e-9 if len(scale) == 6 else 1e-6) * np.eye(len(scale))  # depth errors and pose are hardly told apart
     L = np.linalg.cholesky(data.information * np.outer(scale, scale) + floor)
     inner = np.linalg.solve(L, np.linalg.solve(L, data.observed * np.outer(scale, scale)).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))

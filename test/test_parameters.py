@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from garps_core.config import Checked, Config, setting
+from garps_core.config import Config
+from garps_core.described import Checked, setting
 from garps_core.errors import ConfigError
 from garps_ros import parameter_docs
 from garps_ros.parameters import parameters, settings_from

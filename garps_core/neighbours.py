@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact nearest neighbours of a camera's surfaces, compiled: partners sorted into cells of the image they came from.
+
+Faster than a k-d tree because a surface seen by a camera is nearly flat in the image: the neighbours of a point lie in
+the cells around its pixel. `pairing.py` falls back on SciPy's tree.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from garps_core.compiled import Float32, Int64, loop
+
+PER_CELL = 2.0
+"""Partners in a cell, on average."""
+
+
+@loop
+def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tuple[Int64, Float32]:
+    """The k nearest partners of each row, exact: indices (n, k) by distance, and distances (n, k).
+
+    rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Distances in metres, or in
+    `pairing.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
+    around a row's pixel are searched until no unseen cell can hold a nearer one: whatever lies beyond a line x = a z
+    of the image is at least |x - a z| / sqrt(1 + a^2) away.
+    """
+    n, m, in_image = len(rows), len(partners), depth_weight < 1
+    slopes = np.empty((m, 2), np.float32)
+    for i in range(m):
+        for axis in range(2):
+            slopes[i, axis] = partners[i, axis] / partners[i, 2]
+    low_x, low_y = slopes[:, 0].min(), slopes[:, 1].min()
+    span_x, span_y = slopes[:, 0].max() - low_x + 1e-6, slopes[:, 1].max() - low_y + 1e-6
+    cell = np.sqrt(span_x * span_y * PER_CELL / m)
+    cell = max(cell, span_x / 1024, span_y / 1024)
+    across, down = int(span_x / cell) + 1, int(span_y / cell) + 1
+    first, order = _sorted_into_cells(slopes, low_x, low_y, cell, across, down)
+    points = np.empty((m, 3), np.float32)
+    for i in range(m):
+        p = partners[order[i]]
+        if in_image:
+            points[i, 0], points[i, 1] = p[0] / p[2], p[1] / p[2]
+            points[i, 2] = depth_weight * np.log(p[2])
+        else:
+            points[i, 0], points[i, 1], points[i, 2] = p[0], p[1], p[2]
+    grid = (low_x, low_y, cell, across, down)
+    index, distance = np.empty((n, k), np.int64), np.empty((n, k), np.float32)
+    best, where = np.empty(k, np.float32), np.empty(k, np.int64)
+    for i in range(n):
+        x, y, z = rows[i, 0], rows[i, 1], rows[i, 2]
+        safe = max(z, np.float32(1e-3))
+        q0, q1, q2 = x, y, z
+        if in_image:
+            q0, q1, q2 = x / safe, y / safe, np.float32(depth_weight * np.log(safe))
+        _search_rings(q0, q1, q2, x / safe, y / safe, z, points, first, grid, in_image, best, where)
+        for j in range(k):
+            index[i, j], distance[i, j] = order[where[j]], np.sqrt(best[j])
+    return index, distance
+
+
+@loop
+def _search_rings(
+    q0: float, q1: float, q2: float, slope_x: float, slope_y: float, z: float, points: Float32, first: Int64,
+    grid: tuple[float, float, float, int, int], in_image: bool, best: Float32, where: Int64,
+) -> None:  # fmt: skip
+    """Fill `best` (squared distances, sorted) and `where` with the nearest points of (q0, q1, q2)."""
+    low_x, low_y, cell, across, down = grid
+    column = min(max(int((slope_x - low_x) / cell), 0), across - 1)
+    row = min(max(int((slope_y - low_y) / cell), 0), down - 1)
+    best[:] = np.inf
+    where[:] = 0
+    ring = 0
+    while True:
+        for v in range(max(row - ring, 0), min(row + ring, down - 1) + 1):
+            step = 1 if abs(v - row) == ring else max(2 * ring, 1)
+            for u in range(column - ring, column + ring + 1, step):
+                if u >= 0 and u < across:
+                    _keep_nearest(q0, q1, q2, points, first[v * across + u], first[v * across + u + 1], best, where)
+        bound = np.inf
+        if column - ring > 0:
+            line = low_x + (column - ring) * cell
+            bound = min(bound, _beyond(slope_x - line, line, z, in_image))
+        if column + ring + 1 < across:
+            line = low_x + (column + ring + 1) * cell
+            bound = min(bound, _beyond(line - slope_x, line, z, in_image))
+        if row - ring > 0:
+            line = low_y + (row - ring) * cell
+            bound = min(bound, _beyond(slope_y - line, line, z, in_image))
+        if row + ring + 1 < down:
+            line = low_y + (row + ring + 1) * cell
+            bound = min(bound, _beyond(line - slope_y, line, z, in_image))
+        if bound == np.inf or bound * bound > best[-1]:
+            return
+        ring += 1
+
+
+@loop
+def _keep_nearest(
+    q0: float, q1: float, q2: float, points: Float32, begin: int, end: int, best: Float32, where: Int64
+) -> None:
+    """Insert the points of one cell that are nearer than the farthest kept so far."""
+    last = len(best) - 1
+    for p in range(begin, end):
+        d0, d1, d2 = points[p, 0] - q0, points[p, 1] - q1, points[p, 2] - q2
+        d = d0 * d0 + d1 * d1 + d2 * d2
+        if d < best[last]:
+            place = last
+            while place > 0 and best[place - 1] > d:
+                best[place], where[place] = best[place - 1], where[place - 1]
+                place -= 1
+            best[place], where[place] = d, p
+
+
+@loop
+def _beyond(gap: float, line: float, z: float, in_image: bool) -> float:
+    """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when nothing is known."""
+    if gap <= 0 or z <= 1e-3:
+        return 0.0
+    return gap if in_image else gap * z / np.sqrt(1 + line * line)
+
+
+@loop
+def _sorted_into_cells(
+    slopes: Float32, low_x: float, low_y: float, cell: float, across: int, down: int
+) -> tuple[Int64, Int64]:
+    """First position of every cell (cells + 1,), and the partners in order of their cells (m,)."""
+    m = len(slopes)
+    of, first = np.empty(m, np.int64), np.zeros(across * down + 1, np.int64)
+    for i in range(m):
+        u = min(int((slopes[i, 0] - low_x) / cell), across - 1)
+        v = min(int((slopes[i, 1] - low_y) / cell), down - 1)
+        of[i] = v * across + u
+        first[of[i] + 1] += 1
+    for i in range(across * down):
+        first[i + 1] += first[i]
+    place, order = first.copy(), np.empty(m, np.int64)
+    for i in range(m):
+        order[place[of[i]]] = i
+        place[of[i]] += 1
+    return first, order
