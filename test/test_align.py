@@ -33,7 +33,8 @@ PUBLIC = {
     "InputError": None,
     "Mixture": ["means", "covariances", "weights", "colours", "labels", "frustum"],
     "PoseEstimate": [
-        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "seconds",
+        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality",
+        "seconds",
     ],
     "Prior": ["T_target_source", "covariance", "origin", "reason"],
     "ReconstructionError": None,
@@ -77,7 +78,7 @@ def test_every_status_says_what_it_means():
 def test_an_estimate_without_a_pose_is_no_identity_in_disguise():
     nothing = PoseEstimate(Status.LOW_OVERLAP, "nothing shared")
     assert nothing.T_target_source is None and nothing.covariance is None and nothing.initial is None
-    assert np.isnan(nothing.objective) and nothing.overlap == 0 and nothing.seconds == {}
+    assert np.isnan(nothing.objective) and nothing.overlap == nothing.quality == 0 and nothing.seconds == {}
 
 
 def test_pose_from_sensor_depth(sensor_pair, estimate):
@@ -123,24 +124,50 @@ def test_pose_from_monocular_depth():
     source, target, truth = room(1, 1, "monocular")
     estimate = estimate_relative_pose(source, target, Config.preset("monocular"))
     assert estimate.ok and estimate.initial.origin == "features"
-    assert translation_error_m(estimate.T_target_source, truth) < 0.03
-    assert rotation_error_deg(estimate.T_target_source, truth) < 0.5
-    sensor = estimate_relative_pose(source, target)
-    assert np.trace(estimate.covariance[:3, :3]) > np.trace(sensor.covariance[:3, :3]), "it knows its depth is worse"
+    assert translation_error_m(estimate.T_target_source, truth) < 0.015
+    assert rotation_error_deg(estimate.T_target_source, truth) < 0.25
+    assert nees(estimate.T_target_source, estimate.covariance, truth) < 25
+    believed = estimate_relative_pose(source, target, Config.preset("monocular").replace({"alignment.brightness": 0.0}))
+    assert np.trace(estimate.covariance[:3, :3]) < 0.9 * np.trace(believed.covariance[:3, :3]), "brightness sharpens"
 
 
-def test_a_given_prior_takes_the_place_of_features(sensor_pair):
+@pytest.mark.xfail(strict=True, reason="a search from identity that calls itself converged replaces a better pose")
+def test_depth_that_is_worse_than_the_settings_say_gives_no_wrong_pose():
+    """A network's depth taken for a sensor's: from features the fit is poor, and no other start does better.
+
+    Brightness agrees to 0.99 where features led, and to 0.81 where the search from identity leads, 0.26 m off.
+    """
+    source, target, truth = room(1, 1, "monocular")
+    estimate = estimate_relative_pose(source, target)
+    assert translation_error_m(estimate.T_target_source, truth) < 0.03 or not estimate.ok
+
+
+def test_a_given_prior_and_features_are_one_start(sensor_pair):
     source, target, truth = sensor_pair
     prior = disturbed(truth, twist=[0.03, -0.02, 0.02, 0.005, 0.004, -0.006])
     estimate = estimate_relative_pose(source, target, prior=prior)
-    assert estimate.ok and estimate.initial is prior
-    assert translation_error_m(estimate.T_target_source, truth) < 0.02
+    assert estimate.ok and estimate.initial.origin == "given and features"
+    assert translation_error_m(estimate.initial.T_target_source, truth) < 0.012
+    assert translation_error_m(estimate.T_target_source, truth) < 0.012
+    as_given = estimate_relative_pose(source, target, Config().replace({"start.features": False}), prior)
+    assert as_given.ok and as_given.initial is prior
+    assert translation_error_m(as_given.T_target_source, truth) < 0.02
+
+
+@pytest.mark.parametrize("sigma_m", [0.003, 0.1])
+def test_features_overrule_a_given_prior_that_is_wrong(sensor_pair, sigma_m):
+    """Half a metre off: both are tried, and the views say which is right."""
+    source, target, truth = sensor_pair
+    prior = disturbed(truth, twist=[0.5, 0, 0, 0, 0.1, 0], covariance=FREE * (sigma_m / 0.1) ** 2)
+    estimate = estimate_relative_pose(source, target, prior=prior)
+    assert estimate.ok and estimate.initial.origin == "features" and "contradicts" in estimate.initial.reason
+    assert translation_error_m(estimate.T_target_source, truth) < 0.012
 
 
 def test_whole_pipeline_is_its_parts(sensor_pair, estimate):
     source, target, _ = sensor_pair
     config = Config().replace(MEANT_SENSOR)
-    start = initialise(source, target, config)
+    (start,) = initialise(source, target, config)
     parts = align_mixtures(reconstruct(source, config), reconstruct(target, config), start, config)
     np.testing.assert_array_equal(parts.T_target_source, estimate.T_target_source)
     np.testing.assert_array_equal(parts.covariance, estimate.covariance)
@@ -168,7 +195,8 @@ def test_views_that_look_away_from_each_other_have_no_pose(sensor_pair):
     source, target, truth = sensor_pair
     away = truth.copy()
     away[:3, :3] = np.diag([-1.0, 1, -1]) @ truth[:3, :3]
-    estimate = estimate_relative_pose(source, target, prior=Prior(away, FREE))
+    alone = Config().replace({"start.features": False})
+    estimate = estimate_relative_pose(source, target, alone, Prior(away, FREE))
     assert estimate.status is Status.LOW_OVERLAP
     assert estimate.T_target_source is None and estimate.covariance is None and estimate.initial is not None
     assert {"reconstruct", "initialise"} <= set(estimate.seconds)

@@ -67,7 +67,7 @@ def test_json_holds_the_true_pose(files: dict[str, str], capsys: pytest.CaptureF
     assert np.degrees(np.linalg.norm(error[3:])) < 0.5
     assert np.shape(out["covariance"]) == (6, 6)
     np.testing.assert_allclose(Rotation.from_quat(out["quaternion_xyzw"]).as_matrix(), T[:3, :3], atol=1e-12)
-    assert out["initial"]["origin"] == "given"
+    assert out["initial"]["origin"] == "given and features"
     assert set(out["seconds"]) >= {"reconstruct", "initialise", "align"}
 
 
