@@ -25,6 +25,9 @@ from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.uncertainty import pose_covariance, ros_from_twist, twist_from_ros
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 
+SEARCHED_SIGMAS = 3.0
+"""What a search found may be a neighbour of the right optimum: its sigmas count so many times as much."""
+
 
 def estimate_relative_pose(
     source: View, target: View, config: Config | None = None, prior: Prior | None = None
@@ -131,7 +134,7 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
     maximise = paper.maximise if settings.solver == "adam" else search if guess else solve.anneal
-    findings = [_finding(solution, x, y, known, config) for solution in maximise(x, y, known, settings)]
+    findings = [_finding(solution, x, y, known, guess, config) for solution in maximise(x, y, known, settings)]
     if not findings:
         shared = overlap(x, y, known.T, settings)
         return _too_little(shared, initial, settings)
@@ -169,13 +172,13 @@ def _known(initial: Prior, config: Config) -> Belief:
     return Belief(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
 
 
-def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, config: Config) -> Finding:
+def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool, config: Config) -> Finding:
     """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
     covariance = pose_covariance(solution, known, config.lifting)
     seen = None
     if x.frustum is not None and y.frustum is not None:
-        prior = twist_from_ros(covariance, T)
+        prior = twist_from_ros(covariance, T) * (SEARCHED_SIGMAS**2 if guess else 1.0)
         seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
     if seen is not None and settings.brightness > 0:
         T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)

@@ -19,6 +19,17 @@ def skew(w: Array) -> Array:
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
+def point_jacobian(points: Array) -> Array:
+    """(n, 3) -> (n, 3, 6) d (exp(x) p) / dx at x = 0 over a left twist: [I, -[p]x]."""
+    J = np.zeros((len(points), 3, 6))
+    J[:, 0, 0] = J[:, 1, 1] = J[:, 2, 2] = 1.0
+    x, y, z = points.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J
+
+
 def nearest_rotation(R: Array) -> Array:
     """The rotation closest to a 3x3 matrix in Frobenius norm (SVD)."""
     U, _, Vt = np.linalg.svd(R)

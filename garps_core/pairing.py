@@ -129,7 +129,8 @@ def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignm
 def widened(covariances: Tensor, rung: Rung) -> Tensor:
     """Packed covariances (n, 6) as a rung sees them: scaled, and blurred in all directions by half of `blur_m`'s."""
     wider = covariances * rung.covariance_scale
-    wider[:, [0, 3, 5]] += 0.5 * rung.blur_m**2
+    if rung.blur_m > 0:
+        wider[:, [0, 3, 5]] += 0.5 * rung.blur_m**2
     return wider
 
 

@@ -18,7 +18,7 @@ import poselib
 from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
-from garps_core.geometry import Array, adjoint, project, se3_exp, se3_inverse, skew, transform
+from garps_core.geometry import Array, adjoint, point_jacobian, project, se3_exp, se3_inverse, transform
 from garps_core.reconstruct import depth_sigma
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
@@ -115,7 +115,7 @@ def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Liftin
     D = np.zeros((len(z), 2, 3))  # d pixel / d point in the seeing camera
     D[:, 0, 0], D[:, 0, 2] = way.K[0, 0] / z, -way.K[0, 0] * x / z**2
     D[:, 1, 1], D[:, 1, 2] = way.K[1, 1] / z, -way.K[1, 1] * y / z**2
-    J = np.concatenate([D, -D @ np.stack([skew(p) for p in moved])], axis=2) if len(z) else np.zeros((0, 2, 6))
+    J = D @ point_jacobian(moved)
     along = D @ (T[:3, :3] @ way.points.T).T[..., None]  # pixels per unit of relative depth
     relative = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / np.maximum(way.points[:, 2], 1e-6)
     C = pixel_sigma**2 * np.eye(2) + along @ along.transpose(0, 2, 1) * relative[:, None, None] ** 2

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.checks import Float32Array
+from garps_core.checks import Float32Array, Float64Array
 from garps_core.config import Config, Lifting
 from garps_core.errors import ReconstructionError
 from garps_core.photometric import brightness_of
@@ -47,8 +47,8 @@ def reconstruct(view: View, config: Config | None = None) -> Mixture:
     lifting = (config or Config()).lifting
     if view.depth is None:
         raise ReconstructionError("the view has no depth: expected HxW float32 metres; give View(..., depth=...)")
-    depth = _smoothed(_in_range(view.depth, lifting), lifting)
-    rows, columns = _sampled_pixels(depth, lifting)
+    depth = _in_range(view.depth, lifting)
+    rows, columns = _sampled(depth, lifting)
     if len(rows) < MIN_COMPONENTS:
         raise ReconstructionError(
             f"the view has {len(rows)} usable depth pixels of {depth.size} "
@@ -65,21 +65,23 @@ def _in_range(depth: Float32Array, lifting: Lifting) -> Float32Array:
 
 
 def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """Edge-keeping average over valid neighbours (bilateral with a range kernel of a few noise sigmas)."""
-    radius = lifting.smoothing_px // 2
+    """Depth on the sampling grid, averaged over close valid neighbours (bilateral, range kernel of a few sigmas)."""
+    s, radius = lifting.stride, lifting.smoothing_px // 2
+    first = s // 2
+    centre = depth[first::s, first::s]
     if radius == 0:
-        return depth
-    sigma = 3.0 * depth_sigma(depth, lifting)
-    total, weight = np.zeros_like(depth), np.zeros_like(depth)
+        return centre
+    sigma = 3.0 * depth_sigma(centre, lifting)
+    total, weight = np.zeros_like(centre), np.zeros_like(centre)
     padded = np.pad(depth, radius, constant_values=np.nan)
     height, width = depth.shape
-    step = max(1, radius)  # a sparse kernel: centre, and eight neighbours at the radius
     with np.errstate(invalid="ignore", divide="ignore"):
-        for dy in range(-radius, radius + 1, step):
-            for dx in range(-radius, radius + 1, step):
-                other = padded[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
-                close = np.abs(other - depth) <= sigma  # true for the pixel itself, even where sigma is 0
-                total += np.where(close, other, 0)
+        for dy in (-radius, 0, radius):  # a sparse kernel: centre, and eight neighbours at the radius
+            for dx in (-radius, 0, radius):
+                top, left = radius + dy + first, radius + dx + first
+                other = padded[top : radius + dy + height : s, left : radius + dx + width : s]
+                close = np.abs(other - centre) <= sigma  # true for the pixel itself, even where sigma is 0
+                np.add(total, other, out=total, where=close)
                 weight += close
         return np.where(weight > 0, total / weight, np.float32(np.nan)).astype(np.float32)
 
@@ -90,11 +92,11 @@ def depth_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
     return np.asarray(noise, np.float32)
 
 
-def _sampled_pixels(depth: Float32Array, lifting: Lifting) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Rows and columns of usable pixels on the sampling grid, in Z-order."""
+def _sampled(depth: Float32Array, lifting: Lifting) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns, on the sampling grid, of usable pixels in Z-order."""
     s = lifting.stride
-    rows, columns = _z_order(*depth.shape, s)
-    good = (_smooth_surface(depth, lifting) & np.isfinite(depth))[rows, columns]
+    rows, columns = _z_order(*depth[s // 2 :: s, s // 2 :: s].shape)
+    good = (_smooth_surface(depth, lifting) & np.isfinite(depth))[s // 2 :: s, s // 2 :: s][rows, columns]
     return rows[good], columns[good]
 
 
@@ -108,94 +110,81 @@ def _smooth_surface(depth: Float32Array, lifting: Lifting) -> Bool:
 
 
 @lru_cache(maxsize=8)
-def _z_order(height: int, width: int, stride: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    offset = stride // 2
-    y, x = np.mgrid[0 : (height - offset + stride - 1) // stride, 0 : (width - offset + stride - 1) // stride]
+def _z_order(height: int, width: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    y, x = np.mgrid[0:height, 0:width]
     key = np.zeros(y.shape, np.int64)
     for bit in range(14):
         key |= ((x >> bit) & 1) << (2 * bit) | ((y >> bit) & 1) << (2 * bit + 1)
     order = np.argsort(key, axis=None)
-    return y.ravel()[order] * stride + offset, x.ravel()[order] * stride + offset
+    return y.ravel()[order], x.ravel()[order]
 
 
 def _lift(
     view: View, depth: Float32Array, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], lifting: Lifting
 ) -> Mixture:
+    s = lifting.stride
     fx, fy, cx, cy = (np.float32(view.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    z = depth[rows, columns]
-    rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(z)], axis=1).astype(np.float32)
-    normals = _normals(depth, rows, columns, (fx, fy, cx, cy), lifting.stride)
-    length = np.linalg.norm(rays, axis=1)
-    cosine = np.maximum(np.abs((normals * rays).sum(1)) / length, np.float32(lifting.min_cosine))
+    v, u = rows * s + s // 2, columns * s + s // 2
+    smooth = _smoothed(depth, lifting)
+    z = smooth[rows, columns]
+    x, y = ((u - cx) / fx).astype(np.float32), ((v - cy) / fy).astype(np.float32)
+    rays = np.stack([x, y, np.ones_like(z)], axis=1)
+    normals = _normals(smooth, view.K, s)[rows, columns]
+    length = np.sqrt(x * x + y * y + 1)
+    along = normals[:, 0] * x + normals[:, 1] * y + normals[:, 2]
+    cosine = np.maximum(np.abs(along) / length, np.float32(lifting.min_cosine))
     # the pixel's solid angle, (stride^2 / fx fy) / length^3, times range^2, over the cosine
-    area = (z * lifting.stride) ** 2 / (fx * fy) / (cosine * length)
-    covariances = _covariances(z, rays, normals, cosine, depth_sigma(z, lifting), fx, fy, lifting)
+    area = (z * s) ** 2 / (fx * fy) / (cosine * length)
     return Mixture._trusted(
         rays * z[:, None],
-        covariances,
+        _covariances(z, rays, normals, along, depth_sigma(z, lifting), (fx, fy), lifting),
         area if lifting.weighting == "area" else np.ones_like(area),
-        view.rgb[rows, columns].astype(np.float32) / np.float32(255),
+        view.rgb[v, u].astype(np.float32) / np.float32(255),
         None,
         _frustum(view, depth),
     )
 
 
-def _normals(
-    depth: Float32Array,
-    rows: npt.NDArray[np.intp],
-    columns: npt.NDArray[np.intp],
-    camera: tuple[np.float32, ...],
-    stride: int,
-) -> Float32Array:
-    """Unit normals from central differences of the inverse depth, which is linear in the pixel on a plane.
+def _normals(depth: Float32Array, K: Float64Array, stride: int) -> Float32Array:
+    """Unit normals (h, w, 3) from central differences of the inverse depth, which is linear in the pixel on a plane.
 
-    On a plane n.X = d, with X = z ray: n.ray / d = 1/z, so the gradient of 1/z gives the normal up to scale.
+    On a plane n.X = d, with X = z ray: n.ray / d = 1/z, so the gradient of 1/z gives the normal up to scale. depth is
+    that of every stride-th pixel.
     """
-    fx, fy, cx, cy = camera
+    fx, fy, cx, cy = (np.float32(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     with np.errstate(invalid="ignore"):
         inverse = 1.0 / depth
-    h, w = depth.shape
-    reach = max(2, stride)
-    gx = _difference(inverse, rows, columns, 0, reach, h, w)
-    gy = _difference(inverse, rows, columns, reach, 0, h, w)
+    reach = 2 if stride == 1 else 1
+    gx, gy = _difference(inverse, reach, 1) / np.float32(stride), _difference(inverse, reach, 0) / np.float32(stride)
+    v, u = (np.arange(n, dtype=np.float32) * stride + stride // 2 for n in depth.shape)
     a, b = gx * fx, gy * fy
-    c = inverse[rows, columns] - gx * (columns - cx) - gy * (rows - cy)
-    normals = np.stack([a, b, c], axis=1)
-    missing = ~np.isfinite(normals).all(1)
-    normals[missing] = np.stack([np.zeros(missing.sum())] * 2 + [np.ones(missing.sum())], axis=1)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), np.float32)
-
-
-def _difference(
-    field: Float32Array,
-    rows: npt.NDArray[np.intp],
-    columns: npt.NDArray[np.intp],
-    dy: int,
-    dx: int,
-    height: int,
-    width: int,
-) -> Float32Array:
-    """Slope per pixel: central where both neighbours are there, else one-sided, else NaN."""
-    ahead = field[np.minimum(rows + dy, height - 1), np.minimum(columns + dx, width - 1)]
-    behind = field[np.maximum(rows - dy, 0), np.maximum(columns - dx, 0)]
-    here = field[rows, columns]
-    reach_ahead = np.minimum(rows + dy, height - 1) - rows + np.minimum(columns + dx, width - 1) - columns
-    reach_behind = rows - np.maximum(rows - dy, 0) + columns - np.maximum(columns - dx, 0)
+    c = inverse - gx * (u - cx) - gy * (v - cy)[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        central = (ahead - behind) / (reach_ahead + reach_behind)
-        forward, backward = (ahead - here) / reach_ahead, (here - behind) / reach_behind
+        scale = 1 / np.sqrt(a * a + b * b + c * c)
+    missing = ~np.isfinite(scale)
+    return np.stack([np.where(missing, o, part * scale) for part, o in ((a, 0), (b, 0), (c, 1))], axis=2).astype(
+        np.float32, copy=False
+    )
+
+
+def _difference(field: Float32Array, reach: int, axis: int) -> Float32Array:
+    """Slope per cell along an axis: central where both neighbours are there, else one-sided, else NaN."""
+    moved = np.moveaxis(field, axis, 0)
+    edge = np.full((reach, *moved.shape[1:]), np.nan, np.float32)
+    ahead, behind = np.concatenate([moved[reach:], edge]), np.concatenate([edge, moved[:-reach]])
+    with np.errstate(invalid="ignore"):
+        central, forward, backward = (ahead - behind) / (2 * reach), (ahead - moved) / reach, (moved - behind) / reach
     one_sided = np.where(np.isfinite(forward), forward, backward)
-    return np.asarray(np.where(np.isfinite(central), central, one_sided), np.float32)
+    return np.moveaxis(np.where(np.isfinite(central), central, one_sided), 0, axis)
 
 
 def _covariances(
     z: Float32Array,
     rays: Float32Array,
     normals: Float32Array,
-    cosine: Float32Array,
+    along: Float32Array,
     sigma: Float32Array,
-    fx: np.float32,
-    fy: np.float32,
+    focal: tuple[np.float32, np.float32],
     lifting: Lifting,
 ) -> Float32Array:
     """Footprint in the tangent plane + sigma^2 along the ray, Nx3x3 m^2.
@@ -203,18 +192,19 @@ def _covariances(
     The footprint of a pixel step is the move on the tangent plane that keeps the next pixel's ray:
     dX = (z / f) (e - ray (n.e) / (n.ray)), e the image axis; n.ray is clipped at the smallest cosine.
     """
-    along = (normals * rays).sum(1)
-    signed = np.where(along < 0, -1, 1) * np.maximum(np.abs(along), lifting.min_cosine)
+    signed = np.where(along < 0, -1, 1) * np.maximum(np.abs(along), np.float32(lifting.min_cosine))
     spread = np.float32(lifting.footprint * lifting.stride)
-    covariances = np.einsum("ni,nj->nij", rays * sigma[:, None], rays * sigma[:, None])
-    for axis, focal in ((0, fx), (1, fy)):
-        step = -rays * (normals[:, axis] / signed)[:, None]
-        step[:, axis] += 1
-        step *= (z * spread / focal)[:, None]
-        covariances += np.einsum("ni,nj->nij", step, step)
-    floor = np.float32(1e-3) * np.maximum(z * spread / fx, 1e-4) ** 2  # keeps exact depth (sigma 0) definite
-    covariances[:, range(3), range(3)] += floor[:, None]
-    return np.asarray(covariances, np.float32)
+    spans = [[sigma * rays[:, i] for i in range(3)]]
+    for axis in (0, 1):
+        tilt, size = normals[:, axis] / signed, z * (spread / focal[axis])
+        spans.append([size * ((1 if i == axis else 0) - rays[:, i] * tilt) for i in range(3)])
+    floor = np.float32(1e-3) * np.maximum(z * spread / focal[0], np.float32(1e-4)) ** 2  # keeps exact depth definite
+    covariances = np.empty((len(z), 3, 3), np.float32)
+    for i in range(3):
+        for j in range(i, 3):
+            element = sum((span[i] * span[j] for span in spans), start=floor if i == j else np.float32(0))
+            covariances[:, i, j] = covariances[:, j, i] = element
+    return covariances
 
 
 def _frustum(view: View, depth: Float32Array) -> Frustum:

@@ -17,8 +17,9 @@ from garps_core.joint import State
 from garps_core.pairing import Cloud, overlap
 from garps_core.solve import Belief, Solution, descend, seen_closely
 
-TURNS = (1.3, 3.0)
-"""Beginnings are turned by so many sigmas of the guess's rotation."""
+RINGS = ((1.5, 6, 0.0), (3.0, 8, 0.5))
+"""Beginnings are turned by so many sigmas of the guess's rotation, about so many axes across the view, the first
+so many steps from x."""
 SAME_RAD = 0.1
 """Beginnings that end closer to each other than this (rad, m) are one."""
 
@@ -40,15 +41,14 @@ def search(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> 
 
 
 def beginnings(known: Belief) -> list[Array]:
-    """Poses to begin from: the guess itself, and it turned both ways about the camera's x and y axes."""
+    """Poses to begin from: the guess itself, and it turned about axes across the line of sight."""
     sigma = float(np.sqrt(np.trace(np.linalg.inv(known.precision)[3:, 3:]) / 3))
     poses = [known.T]
-    for turns in TURNS:
-        for axis in (0, 1):
-            for sign in (1, -1):
-                T = np.eye(4)
-                T[:3, :3] = Rotation.from_rotvec(sign * turns * sigma * np.eye(3)[axis]).as_matrix()
-                poses.append(T @ known.T)
+    for turns, count, first in RINGS:
+        for angle in 2 * np.pi * (np.arange(count) + first) / count:
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_rotvec(turns * sigma * np.array([np.cos(angle), np.sin(angle), 0])).as_matrix()
+            poses.append(T @ known.T)
     return poses
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from garps_core.config import Alignment, Rung
-from garps_core.geometry import Array, se3_inverse, se3_log, skew
+from garps_core.geometry import Array, point_jacobian, se3_inverse, se3_log, skew
 from garps_core.joint import State, corrected, evaluate_at, two_sided
 from garps_core.objective import Evaluation, Pairs, unpack
 from garps_core.pairing import Cloud, pair_up, thin, visible
@@ -199,7 +199,7 @@ def _at_resolution(cloud: Cloud, rung: Rung, density: float) -> Cloud:
 
 def displacement(points: Array, covariance: Array) -> Array:
     """(n, 3, 3) covariance of points (n, 3) m moved by a pose with the given 6x6 covariance (left twist)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -np.stack([skew(p) for p in points])], axis=2)
+    J = point_jacobian(points)
     return np.asarray(J @ covariance @ J.transpose(0, 2, 1))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from garps_core.config import Lifting
-from garps_core.geometry import Array, adjoint, se3_inverse, skew
+from garps_core.geometry import Array, adjoint, point_jacobian, se3_inverse, skew
 from garps_core.joint import State, backward_jacobian
 from garps_core.objective import Pairs, row_information
 from garps_core.solve import Belief, Solution, curvature
@@ -90,7 +90,7 @@ def _one_way_pull(pairs: Pairs, T: Array, errors: int) -> tuple[Array, Array]:
     Q, moved = row_information(pairs, T)
     rows = T[:3, :3] @ shared_errors(pairs.means.double().cpu().numpy())
     partners = shared_errors(moved)
-    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), -np.stack([skew(p) for p in moved])], axis=2)
+    J = point_jacobian(moved)
     if errors:
         J = np.concatenate([J, rows[:, :, :DEPTH_MODES], -partners[:, :, :DEPTH_MODES]], axis=2)
     JQ = J.transpose(0, 2, 1) @ Q

@@ -15,6 +15,9 @@ from garps_core.solve import Solution, displacement
 from garps_core.types import Mixture, Prior, Status
 from garps_core.uncertainty import twist_from_ros
 
+RIGHT_M, RIGHT_RAD = 0.05, float(np.radians(2.0))
+"""What `quality` means by right."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -99,5 +102,21 @@ def _doubt(found: Finding, initial: Prior, guess: bool, settings: Alignment) -> 
 
 
 def quality(found: Finding, guess: bool) -> float:
-    """How likely the pose is right to 5 cm and 2 deg, 0..1."""
-    return 0.0
+    """How likely the pose is right to 5 cm and 2 deg, 0..1: to gate on and to rank by, not calibrated.
+
+    The chance that errors of its covariance stay that small, times how well the views agree: the correlation of their
+    brightness, where it is known, and the share of components with a partner.
+    """
+    covariance = found.covariance
+    metres, radians = (float(np.sqrt(np.trace(part))) for part in (covariance[:3, :3], covariance[3:, 3:]))
+    precise = np.exp(-0.5 * (metres / RIGHT_M) ** 2 - 0.5 * (radians / RIGHT_RAD) ** 2)
+    agreement = _logistic((found.solution.data.support - 0.4) / 0.1)
+    if found.seen is not None:
+        agreement *= _logistic((found.seen.correlation - 0.75) / 0.05)
+    elif guess:
+        agreement *= 0.5
+    return float(precise * agreement)
+
+
+def _logistic(x: float) -> float:
+    return float(1 / (1 + np.exp(-np.clip(x, -50, 50))))
