@@ -11,11 +11,11 @@ from garps_core import Config, Prior, Status, View, estimate_relative_pose
 from garps_core.config import Start
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches, match_features
-from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, transform
-from garps_core.initialise import initialise
+from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
+from garps_core.initialise import combined, initialise
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
 from garps_core.pnp import pose_from_matches
-from garps_core.uncertainty import inverted
+from garps_core.uncertainty import inverted, twist_from_ros
 
 FEATURES = Config().replace({"start.method": "features"})
 STRICT = Config().replace({"start.identity_fallback": False})
@@ -229,3 +229,85 @@ def test_the_same_seed_gives_the_same_start():
     (a,), (b,) = initialise(source, target), initialise(source, target)
     assert a.T_target_source.tobytes() == b.T_target_source.tobytes()
     assert a.covariance.tobytes() == b.covariance.tobytes()
+
+
+def a_prior(twist=(0, 0, 0, 0, 0, 0), covariance=FREE, origin="given"):
+    """Off the truth by a twist, with the covariance of a twist."""
+    return replace(disturbed(twist=twist, covariance=covariance), origin=origin)
+
+
+def of_twist(prior):
+    return twist_from_ros(prior.covariance, prior.T_target_source)
+
+
+def random_covariance(seed):
+    A = np.random.default_rng(seed).normal(size=(6, 6)) * ([0.05] * 3 + [0.02] * 3)
+    return A.T @ A + np.diag([1e-4] * 3 + [1e-5] * 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_information_of_two_measurements_adds_up(seed):
+    given, found = (a_prior(covariance=random_covariance(10 * seed + i), origin="x") for i in (1, 2))
+    (both,) = combined(given, found, 5.0)
+    information = sum(np.linalg.inv(of_twist(prior)) for prior in (given, found))
+    np.testing.assert_allclose(np.linalg.inv(of_twist(both)), information, rtol=1e-6, atol=1e-6 * information.max())
+    for single in (given, found):
+        assert np.linalg.eigvalsh(single.covariance - both.covariance)[0] > 0, "more certain in every direction"
+    np.testing.assert_allclose(both.T_target_source, TRUTH, atol=1e-12)
+
+
+def test_equal_measurements_meet_in_the_middle():
+    twist = np.array([0.02, -0.03, 0.01, 0.01, 0.004, -0.01])
+    (both,) = combined(a_prior(twist), a_prior(origin="features"), 5.0)
+    np.testing.assert_allclose(both.T_target_source, se3_exp(0.5 * twist) @ TRUTH, atol=1e-9)
+    np.testing.assert_allclose(of_twist(both), FREE / 2, rtol=1e-2, atol=1e-7)
+
+
+@pytest.mark.parametrize("sharper", ["given", "features"])
+def test_the_more_precise_measurement_counts_more_whoever_made_it(sharper):
+    """A tenth of the sigma, a hundredth of the way."""
+    twist = np.array([0.03, 0, 0, 0, 0.01, 0])
+    scale = {"given": 1.0, "features": 1.0} | {sharper: 0.01}
+    given = a_prior(twist, scale["given"] * FREE)
+    (both,) = combined(given, a_prior(covariance=scale["features"] * FREE, origin="features"), 5.0)
+    moved = se3_log(both.T_target_source @ se3_inverse(TRUTH))
+    share = {"given": 100 / 101, "features": 1 / 101}[sharper]
+    np.testing.assert_allclose(moved, share * twist, atol=1e-6)
+
+
+def test_either_measurement_may_be_called_the_given_one():
+    """To first order; the difference of the two is small."""
+    a, b = a_prior([0.01, 0.02, 0, 0.004, 0, 0.003], random_covariance(3)), a_prior(covariance=random_covariance(4))
+    (one,), (other,) = combined(a, b, 50.0), combined(b, a, 50.0)
+    assert translation_error_m(one.T_target_source, other.T_target_source) < 2e-4
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=0.02 * one.covariance.max())
+
+
+def test_measurements_that_contradict_each_other_are_two_starts():
+    """5 sigmas of the difference, which has the covariance of both: sqrt(2) times either's."""
+    for sigmas, starts in ((4.9, 1), (5.1, 2)):
+        given = a_prior([sigmas * 0.1 * np.sqrt(2), 0, 0, 0, 0, 0])
+        assert len(combined(given, a_prior(origin="features"), 5.0)) == starts
+        assert len(combined(given, a_prior(origin="features"), 5.2)) == 1
+    features, kept = combined(given, replace(a_prior(), origin="features", reason="80 matches"), 5.0)
+    assert (features.origin, kept.origin) == ("features", "given"), "features come first"
+    assert features.reason == "80 matches; contradicts the given prior: 5.1 sigmas apart (5 allowed)"
+    assert kept.reason == "contradicts the features: 5.1 sigmas apart (5 allowed)"
+    np.testing.assert_allclose(kept.T_target_source, given.T_target_source, atol=1e-12)
+    np.testing.assert_array_equal(kept.covariance, given.covariance)
+    np.testing.assert_allclose(features.T_target_source, TRUTH, atol=1e-15)
+
+
+def test_features_sharpen_a_given_prior_or_contradict_it():
+    source, target, truth = room(1, 2)
+    (features,) = initialise(source, target)
+    (both,) = initialise(source, target, None, disturbed(truth))
+    assert both.origin == "given and features"
+    assert both.reason.startswith(features.reason) and "sigmas from the given prior" in both.reason
+    assert np.linalg.eigvalsh(features.covariance - both.covariance)[0] > 0
+    assert translation_error_m(both.T_target_source, features.T_target_source) < 0.005
+    wrong = disturbed(truth, twist=[0.5, 0, 0, 0, 0, 0], covariance=1e-2 * FREE)
+    starts = initialise(source, target, None, wrong)
+    assert [start.origin for start in starts] == ["features", "given"]
+    np.testing.assert_allclose(starts[1].T_target_source, wrong.T_target_source, atol=1e-12)
+    assert len(initialise(source, target, Config().replace({"start.max_contradiction": 1e3}), wrong)) == 1

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a guess: beginnings all around it, the right one found by shape alone, and no pose where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
+
+from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose, reconstruct, search, solve
+from garps_core.geometry import se3_inverse, se3_log
+from garps_core.initialise import identity
+from garps_core.pairing import to_cloud
+from garps_core.solve import Belief
+
+FROM_IDENTITY = Config().replace({"start.method": "identity"})
+LADDER_ONLY = FROM_IDENTITY.replace({"alignment.guess_uncertainty": 1e6})
+
+
+def grey(view):
+    """The view without its picture: depth alone is left."""
+    return replace(view, rgb=np.full_like(view.rgb, 128))
+
+
+def belief(sigma_rad, T):
+    return Belief(T, np.linalg.inv(np.diag([0.3**2] * 3 + [sigma_rad**2] * 3)))
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+def test_beginnings_surround_the_guess_which_is_the_first(sigma):
+    T = random_pose(1, 0.5)
+    poses = search.beginnings(belief(sigma, T))
+    assert poses[0] is T and 9 <= len(poses) <= 40
+    turns = np.array([Rotation.from_matrix((pose @ se3_inverse(T))[:3, :3]).as_rotvec() for pose in poses[1:]])
+    sizes = np.linalg.norm(turns, axis=1) / sigma
+    assert sizes.min() > 0.9 and 2.5 < sizes.max() < 4, "so many sigmas of the guess"
+    np.testing.assert_allclose(turns[:, 2], 0, atol=1e-12)
+    np.testing.assert_allclose(turns.sum(0), 0, atol=1e-9)
+    directions = np.sort(np.arctan2(turns[:, 1], turns[:, 0]))
+    assert np.diff(directions, append=directions[0] + 2 * np.pi).max() < np.pi / 2 + 1e-9, "all around"
+    for pose in poses:
+        np.testing.assert_allclose((pose @ se3_inverse(T))[:3, 3], 0, atol=1e-12)
+
+
+def test_shape_alone_is_found_from_twenty_degrees_away():
+    """0.6 m and 20 degrees from identity, no picture: the ladder alone ends elsewhere."""
+    source, target, truth = room(1, 4)
+    assert off(truth, np.eye(4))[0] == pytest.approx(0.6) and np.degrees(off(truth, np.eye(4))[1]) > 19
+    estimate = estimate_relative_pose(grey(source), grey(target), FROM_IDENTITY)
+    metres, radians = off(estimate.T_target_source, truth)
+    assert estimate.status is Status.CONVERGED and estimate.initial.origin == "identity"
+    assert metres < 0.005 and np.degrees(radians) < 0.1
+    climbed = estimate_relative_pose(grey(source), grey(target), LADDER_ONLY)
+    assert not climbed.ok and off(climbed.T_target_source, truth)[0] > 0.2
+
+
+def test_colours_and_brightness_do_not_mislead_it():
+    source, target, truth = room(2, 4)
+    estimate = estimate_relative_pose(source, target, FROM_IDENTITY)
+    assert estimate.ok and off(estimate.T_target_source, truth)[0] < 0.005
+
+
+@pytest.mark.parametrize("rooms", [(1, 2), (2, 1)])
+def test_views_of_different_rooms_have_no_converged_pose(rooms):
+    """Walls and floors of any two rooms fall together to a degree, hence the proof that a guess has to bring."""
+    source, target = (room(seed, 4)[view] for view, seed in enumerate(rooms))
+    estimate = estimate_relative_pose(source, target, FROM_IDENTITY)
+    assert not estimate.ok
+    assert estimate.status in (Status.POOR_FIT, Status.LOW_OVERLAP, Status.INCONSISTENT), estimate.reason
+
+
+def test_solutions_come_in_order_of_merit_and_are_seen_closely():
+    source, target, truth = room(1, 4)
+    x, y = (to_cloud(reconstruct(view), Config()) for view in (source, target))
+    settings = Config().alignment
+    known = align._known(identity(Config(), ""), Config())
+    found = search.search(x, y, known, settings)
+    merits = [search._merit(solution, x, y, settings) for solution in found]
+    assert 1 < len(found) <= settings.search_followed and merits == sorted(merits, reverse=True)
+    assert off(found[0].T, truth)[0] < 0.005 < off(found[-1].T, truth)[0]
+    for solution in found:
+        assert min(len(pairs.means) for pairs in solution.pairs) > 0
+        assert solution.pairs[0].log_weights.shape[0] == solve.FINAL_NEIGHBOURS
+    (one,) = search.search(x, y, known, replace(settings, search_followed=1))
+    assert one.T.tobytes() in {solution.T.tobytes() for solution in found}
+
+
+def test_beginnings_that_end_together_are_one():
+    poses = [random_pose(1), random_pose(2), random_pose(1, 0.3001), random_pose(2)]
+    solutions = [solve.Solution(solve.State(T), None, 1, True, 1.0, None) for T in poses]
+    kept = search._distinct(solutions)
+    assert kept == solutions[:2]
+    assert np.linalg.norm(se3_log(poses[0] @ se3_inverse(poses[1]))) > search.SAME_RAD
+
+
+def test_a_precise_start_is_not_searched_from(monkeypatch):
+    """What decides is how far scene points may be off, as a share of their range."""
+    mixtures, calls = two_mixtures(), []
+    searched = align.search
+    monkeypatch.setattr(align, "search", lambda *given: calls.append(given) or searched(*given))
+    assert align_mixtures(*mixtures, disturbed()).ok and not calls
+    assert align_mixtures(*mixtures, disturbed(covariance=16 * FREE)).ok and len(calls) == 1
+
+
+def test_from_a_guess_where_nothing_is_seen_there_is_no_pose():
+    """Both look the other way: every beginning finds too few components."""
+    away = np.diag([-1.0, 1, -1, 1]) @ TRUTH
+    estimate = align_mixtures(*two_mixtures(), replace(identity(Config(), ""), T_target_source=away))
+    assert estimate.status is Status.LOW_OVERLAP and estimate.T_target_source is None
+    assert "expected at least 10%" in estimate.reason
