@@ -129,7 +129,7 @@ def _add_partner(w: Float32, total: Float32, rows: int) -> None:
         u2 = p2 * d0 + p4 * d1 + p5 * d2
         D = d0 * u0 + d1 * u1 + d2 * u2
         exponent = min(max(w[19 * ROWS + r] - np.float32(0.5) * D, np.float32(-60)), np.float32(80))
-        g = exponential(exponent) / (np.sqrt(a) * np.sqrt(second) * np.sqrt(third))
+        g = exponential(exponent) * (np.sqrt(r0 * r1) * np.sqrt(p5))
         g0, g1, g2 = g * u0, g * u1, g * u2
         total[r] += g
         total[ROWS + r] += g0

@@ -6,13 +6,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from garps_core.described import Checked, setting
+from garps_core.described import Checked, flattened, replaced, setting
 from garps_core.errors import ConfigError
 
 
@@ -21,10 +19,14 @@ class Lifting(Checked):
     """How a pixel with depth becomes a Gaussian (`reconstruct`)."""
 
     stride: int = setting(2, "use every n-th pixel in both image directions", unit="px", low=1, high=32)
-    noise_floor_m: float = setting(5e-4, "depth noise sigma at zero range", unit="m", low=0, high=1)
-    noise_linear: float = setting(1e-3, "depth noise sigma per metre of range", unit="m/m", low=0, high=1)
+    noise_floor_m: float = setting(1.5e-3, "sigma of one depth reading at zero range", unit="m", low=0, high=1)
+    noise_linear: float = setting(3e-3, "sigma of one depth reading per metre of range", unit="m/m", low=0, high=1)
     noise_quadratic_per_m: float = setting(
-        0.0, "depth noise sigma per square metre of range (triangulating sensors)", unit="1/m", low=0, high=0.1
+        0.0,
+        "sigma of one depth reading per square metre of range (triangulation)",
+        unit="1/m",
+        low=0,
+        high=0.1,
     )
     scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
     warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
@@ -202,10 +204,17 @@ class Config(Checked):
 
     @classmethod
     def preset(cls, name: str) -> Config:
-        """A named configuration: "default", "sensor", "monocular" or "paper". Raises ConfigError on another name."""
+        """A named configuration: one of those in the table below, e.g. "sensor".
+
+        Raises:
+            ConfigError: another name.
+        """
         presets: dict[str, Callable[[], Config]] = {
             "default": cls,
             "sensor": cls,
+            "structured_light": _structured_light,
+            "stereo": _stereo,
+            "time_of_flight": _time_of_flight,
             "monocular": _monocular,
             "paper": _paper,
         }
@@ -217,39 +226,37 @@ class Config(Checked):
         """A copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Raises ConfigError on a typo."""
         config: Config = self
         for name, value in changes.items():
-            config = _replaced(config, name, name.split("."), value)
+            config = replaced(config, name, name.split("."), value)
         return config
 
     def settings(self) -> dict[str, Any]:
         """Every setting by dotted name, in order of definition."""
-        return dict(_flatten("", self))
+        return dict(flattened("", self))
 
 
-def _flatten(prefix: str, part: Any) -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for f in dataclasses.fields(part):
-        value = getattr(part, f.name)
-        name = prefix + f.name
-        rows += _flatten(name + ".", value) if isinstance(value, (Lifting, Start, Alignment)) else [(name, value)]
-    return rows
+def _structured_light() -> Config:
+    """First Kinect and its kin: sigma 1.4 mm/m^2 z^2 (Khoshelham and Elberink 2012, 3.2), and 1 mm of rounding."""
+    return Config(lifting=Lifting(noise_floor_m=1e-3, noise_linear=0.0, noise_quadratic_per_m=1.4e-3))
 
 
-def _replaced(part: Any, name: str, path: list[str], value: Any) -> Any:
-    names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
-    if path[0] not in names:
-        near = difflib.get_close_matches(name, list(Config().settings()), n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else "expected one of the names that Config().settings() lists"
-        raise ConfigError(f"setting {name!r} does not exist; {hint}")
-    if len(path) > 1:
-        value = _replaced(getattr(part, path[0]), name, path[1:], value)
-    return dataclasses.replace(part, **{path[0]: value})
+def _stereo() -> Config:
+    """Active stereo such as RealSense D4xx: 0.1 px of disparity, sigma = z^2 0.1 / (f b); f = 640 px, b = 50 mm.
+
+    Its scale is that of the baseline's calibration, a per cent. Other cameras: noise_quadratic_per_m = 0.1 / (f b).
+    """
+    return Config(lifting=Lifting(noise_floor_m=1e-3, noise_linear=0.0, noise_quadratic_per_m=3.1e-3, scale_sigma=0.01))
+
+
+def _time_of_flight() -> Config:
+    """Azure Kinect, HoloLens, phones: a few mm at any range (data sheets: 17 mm at most), 1 mm more per metre."""
+    return Config(lifting=Lifting(noise_floor_m=4e-3, noise_linear=1e-3))
 
 
 def _monocular() -> Config:
     """Metric depth from one image: right to a few per cent in scale and shape, which are solved for with the pose."""
     ladder = (Rung(100.0, 1000, 20, 8), Rung(30.0, 1500, 20, 8), Rung(10.0, 2000, 15, 10), Rung(4.0, 3000, 15, 15))
     return Config(
-        lifting=Lifting(noise_floor_m=2e-3, noise_linear=0.01, scale_sigma=0.03, warp_sigma=0.02),
+        lifting=Lifting(noise_floor_m=6e-3, noise_linear=0.03, scale_sigma=0.03, warp_sigma=0.02),
         alignment=Alignment(
             ladder=ladder,
             search_ladder=Alignment().search_ladder[:2] + ladder[1:],

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar
@@ -65,3 +66,26 @@ def _check_number(name: str, value: Any, default: float, limits: Mapping[str, An
     low, high = limits.get("low"), limits.get("high")
     if not (value == value and (low is None or value >= low) and (high is None or value <= high)):
         raise ConfigError(f"{name} is {value}: expected between {low} and {high} {limits.get('unit', '')}".rstrip())
+
+
+def flattened(prefix: str, part: Any) -> list[tuple[str, Any]]:
+    """Every setting of a dataclass of settings, and of those inside it, by dotted name, in order of definition."""
+    rows: list[tuple[str, Any]] = []
+    for f in dataclasses.fields(part):
+        value = getattr(part, f.name)
+        name = prefix + f.name
+        rows += flattened(name + ".", value) if isinstance(value, Checked) else [(name, value)]
+    return rows
+
+
+def replaced(part: Any, name: str, path: list[str], value: Any, whole: Any = None) -> Any:
+    """A copy of `part` with the setting at `path` changed. Raises ConfigError, with a hint, where there is none."""
+    whole = part if whole is None else whole
+    names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
+    if path[0] not in names:
+        near = difflib.get_close_matches(name, [known for known, _ in flattened("", whole)], n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else "expected one of the names that Config().settings() lists"
+        raise ConfigError(f"setting {name!r} does not exist; {hint}")
+    if len(path) > 1:
+        value = replaced(getattr(part, path[0]), name, path[1:], value, whole)
+    return dataclasses.replace(part, **{path[0]: value})

@@ -65,13 +65,13 @@ def _in_range(depth: Float32Array, lifting: Lifting) -> Float32Array:
 
 
 def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """Depth on the sampling grid, averaged over close valid neighbours (bilateral, range kernel of a few sigmas)."""
+    """Depth on the sampling grid, averaged over close valid neighbours (bilateral, range kernel of one sigma)."""
     s, radius = lifting.stride, lifting.smoothing_px // 2
     first = s // 2
     centre = depth[first::s, first::s]
     if radius == 0:
         return centre
-    sigma = 3.0 * depth_sigma(centre, lifting)
+    sigma = depth_sigma(centre, lifting)
     total, weight = np.zeros_like(centre), np.zeros_like(centre)
     padded = np.pad(depth, radius, constant_values=np.nan)
     height, width = depth.shape
@@ -86,8 +86,13 @@ def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
         return np.where(weight > 0, total / weight, np.float32(np.nan)).astype(np.float32)
 
 
+def averaged_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
+    """Standard deviation of the depth of a component, m, same shape: the mean of nine readings, unless not smoothed."""
+    return depth_sigma(depth, lifting) / np.float32(3 if lifting.smoothing_px > 1 else 1)
+
+
 def depth_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """Standard deviation of the depth readings, m, same shape (`Lifting.noise_*`)."""
+    """Standard deviation of one depth reading, m, same shape (`Lifting.noise_*`)."""
     noise = lifting.noise_floor_m + depth * (lifting.noise_linear + depth * lifting.noise_quadratic_per_m)
     return np.asarray(noise, np.float32)
 
@@ -137,7 +142,7 @@ def _lift(
     area = (z * s) ** 2 / (fx * fy) / (cosine * length)
     return Mixture._trusted(
         rays * z[:, None],
-        _covariances(z, rays, normals, along, depth_sigma(z, lifting), (fx, fy), lifting),
+        _covariances(z, rays, normals, along, averaged_sigma(z, lifting), (fx, fy), lifting),
         area if lifting.weighting == "area" else np.ones_like(area),
         view.rgb[v, u].astype(np.float32) / np.float32(255),
         None,

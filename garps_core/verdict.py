@@ -104,15 +104,15 @@ def _doubt(found: Finding, initial: Prior, guess: bool, settings: Alignment) -> 
 def quality(found: Finding, guess: bool) -> float:
     """How likely the pose is right to 5 cm and 2 deg, 0..1: to gate on and to rank by, not calibrated.
 
-    The chance that errors of its covariance stay that small, times how well the views agree: the correlation of their
-    brightness, where it is known, and the share of components with a partner.
+    How small its sigmas are, times how well the views agree: the correlation of their brightness, where it is known,
+    and the share of components with a partner.
     """
     covariance = found.covariance
     metres, radians = (float(np.sqrt(np.trace(part))) for part in (covariance[:3, :3], covariance[3:, 3:]))
-    precise = np.exp(-0.5 * (metres / RIGHT_M) ** 2 - 0.5 * (radians / RIGHT_RAD) ** 2)
+    precise = 1 / (1 + (0.5 * metres / RIGHT_M) ** 2 + (0.5 * radians / RIGHT_RAD) ** 2)
     agreement = _logistic((found.solution.data.support - 0.4) / 0.1)
     if found.seen is not None:
-        agreement *= _logistic((found.seen.correlation - 0.75) / 0.05)
+        agreement *= _logistic((found.seen.correlation - 0.75) / 0.08)
     elif guess:
         agreement *= 0.5
     return float(precise * agreement)
