@@ -32,11 +32,11 @@ from bench.runs import Key, RowLog, reusable_rows
 from bench.tables import GARPS, Row, machine_facts, print_tables, write
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
+from garps_core.initialise import identity
 from garps_core.settings import changed_config
 
 GARPS_NO_FEATURES = "garps-no-features"
 """GARPS with `start.features` off: run only where the setting exists, and where the start is not its own features."""
-FEATURES = "start.features"
 VARIANTS = (GARPS, GARPS_NO_FEATURES)
 TABLE_WIDTH = 200
 """Columns of a table that goes to a file or a pipe."""
@@ -77,7 +77,10 @@ def evaluate_pair(
     known: Mapping[str, Row] | None = None,
 ) -> list[Row]:
     """`evaluate` on one pair; peers in `known` are not run, their rows are taken from there."""
-    prior = disturbed_prior(pair, seed) if start == "disturbed" else None
+    prior = {
+        "disturbed": lambda: disturbed_prior(pair, seed),
+        "identity": lambda: identity(config, "a guess"),
+    }.get(start, lambda: None)()
     initial, estimate, seconds = prior, None, float("nan")
     if GARPS in methods or prior is None:
         estimate, seconds = run_garps(config, pair, start, prior)
@@ -88,8 +91,8 @@ def evaluate_pair(
         if name == GARPS and estimate is not None:
             rows.append(_garps_row(pair, start, GARPS, estimate, seconds))
         elif name == GARPS_NO_FEATURES:
-            if FEATURES in config.settings() and start in ("disturbed", "identity"):
-                without = run_garps(config.replace({FEATURES: False}), pair, start, prior)
+            if prior is not None:
+                without = run_garps(config.replace({"start.features": False}), pair, start, prior)
                 rows.append(_garps_row(pair, start, name, *without))
         elif known and name in known:
             rows.append(known[name])
@@ -114,7 +117,7 @@ def _garps_row(pair: Pair, start: str, name: str, estimate: PoseEstimate, second
         "status": estimate.status.value,
         "origin": "" if estimate.initial is None else estimate.initial.origin,
         "overlap": estimate.overlap,
-        "quality": float(getattr(estimate, "quality", float("nan"))),
+        "quality": estimate.quality,
         "iterations": estimate.iterations,
         "objective": estimate.objective,
         **{f"seconds_{stage}": value for stage, value in estimate.seconds.items()},
@@ -123,8 +126,7 @@ def _garps_row(pair: Pair, start: str, name: str, estimate: PoseEstimate, second
 
 def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tuple[PoseEstimate, float]:
     """GARPS from one kind of start: the estimate and its wall time in s."""
-    method = {"features": "features", "identity": "identity", "disturbed": "auto", "none": "auto"}[start]
-    config = config.replace({"start.method": method})
+    config = config.replace({"start.method": "features" if start == "features" else "auto"})
     began = time.perf_counter()
     try:
         estimate = estimate_relative_pose(pair.source, pair.target, config, prior)

@@ -66,7 +66,8 @@ def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) 
     """The best estimate of several starts; where features led nowhere, also a search from identity is tried."""
     estimates = [align_mixtures(x, y, start, config) for start in starts]
     best = max(estimates, key=_merit)
-    if not best.ok and config.start.identity_fallback and starts[0].origin == "features":
+    may_search = config.start.method == "auto" and config.start.identity_fallback
+    if not best.ok and may_search and starts[0].origin == "features":
         reason = f"from features: {best.status.value}, {best.reason}"
         best = max(best, align_mixtures(x, y, identity(config, reason), config), key=_merit)
     return best

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import estimate_relative_pose
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.config import Config
+from garps_core.config import PRESETS, Config
 from garps_core.errors import GarpsError, InputError
 from garps_core.files import read_view
 from garps_core.pairing import checked_device
@@ -89,7 +89,7 @@ def align(
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
     ] = None,
-    preset: Annotated[str, typer.Option(help="default, sensor, monocular or paper.")] = "default",
+    preset: Annotated[str, typer.Option(help=f"One of {', '.join(PRESETS)}.")] = "default",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,

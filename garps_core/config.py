@@ -169,10 +169,10 @@ class Alignment(Checked):
         0.8, "smallest share of components that must find a partner when the start was a guess", low=0, high=1
     )
     min_correlation: float = setting(
-        0.0, "smallest correlation of the views' brightness under the final pose, where it is known", low=-1, high=1
+        0.6, "smallest correlation of the views' brightness under the final pose, where it is known", low=-1, high=1
     )
     guess_correlation: float = setting(
-        0.8, "smallest correlation of the views' brightness when the start was a guess", low=-1, high=1
+        0.76, "smallest correlation of the views' brightness when the start was a guess", low=-1, high=1
     )
     max_uncertainty: float = setting(
         0.05,
@@ -204,23 +204,10 @@ class Config(Checked):
 
     @classmethod
     def preset(cls, name: str) -> Config:
-        """A named configuration: one of those in the table below, e.g. "sensor".
-
-        Raises:
-            ConfigError: another name.
-        """
-        presets: dict[str, Callable[[], Config]] = {
-            "default": cls,
-            "sensor": cls,
-            "structured_light": _structured_light,
-            "stereo": _stereo,
-            "time_of_flight": _time_of_flight,
-            "monocular": _monocular,
-            "paper": _paper,
-        }
-        if name not in presets:
-            raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(presets)}")
-        return presets[name]()
+        """A named configuration, one of `PRESETS`. Raises ConfigError on another name."""
+        if name not in PRESETS:
+            raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(PRESETS)}")
+        return PRESETS[name]()
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
         """A copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Raises ConfigError on a typo."""
@@ -280,3 +267,15 @@ def _paper() -> Config:
             max_prior_sigmas=1e6,
         ),
     )
+
+
+PRESETS: dict[str, Callable[[], Config]] = {
+    "default": Config,
+    "sensor": Config,
+    "time_of_flight": _time_of_flight,
+    "structured_light": _structured_light,
+    "stereo": _stereo,
+    "monocular": _monocular,
+    "paper": _paper,
+}
+"""What `Config.preset` knows; "default" and "sensor" are one and the same."""

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from garps_core.align import estimate_relative_pose
-from garps_core.config import Config
+from garps_core.config import PRESETS, Config
 from garps_core.errors import ConfigError
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
@@ -133,7 +133,7 @@ def replay(
         int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
     ] = 5,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
-    preset: Annotated[str, typer.Option(help="Settings: default, sensor, monocular or paper.")] = "default",
+    preset: Annotated[str, typer.Option(help=f"Settings: {', '.join(PRESETS)}.")] = "default",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
