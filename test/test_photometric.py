@@ -188,6 +188,15 @@ def test_covariance_covers_the_errors_of_noisy_images(views, information):
     assert 0.1 * information < np.mean(values) / 6 < 4 * max(information, 0.1)
 
 
+def test_a_ramp_of_brightness_says_nothing_about_the_shift_along_it():
+    """On a wall, a shift along it is another exposure, and exposure is free; texture closes what it leaves open."""
+    v, u = np.mgrid[:120, :160].astype(np.float32)
+    wall = Frustum(K, np.full(u.shape, 2.5, np.float32), 0.2 + 0.6 * u / 160)
+    ramp = sharpened(wall, wall, np.eye(4))
+    painted = sharpened(*(replace(wall, brightness=wall.brightness + 0.05 * np.sin(u) * np.sin(v)),) * 2, np.eye(4))
+    assert ramp.covariance[0, 0] > 0.9 * NEAR[0, 0] > 100 * painted.covariance[0, 0]
+
+
 @pytest.mark.parametrize("twist", STARTS, ids="+-")
 def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     """At fixed weights and fixed points, with the best exposure; slopes are smoothed, so not to the last digit."""

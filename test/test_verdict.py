@@ -49,7 +49,12 @@ def test_a_pose_far_from_its_start_is_inconsistent():
 
 @pytest.mark.parametrize(
     ("guess", "correlation", "wanted"),
-    [(False, None, 0.35), (False, 0.95, 0.35), (True, 0.95, 0.35), (True, None, 0.8)],
+    [
+        (False, None, SETTINGS.min_support),
+        (False, 0.95, SETTINGS.min_support),
+        (True, 0.95, SETTINGS.min_support),
+        (True, None, SETTINGS.guess_support),
+    ],
 )
 def test_few_components_with_a_partner_are_a_poor_fit(guess, correlation, wanted):
     """After a guess nearly all must have one, unless brightness is the witness."""
@@ -60,7 +65,7 @@ def test_few_components_with_a_partner_are_a_poor_fit(guess, correlation, wanted
     assert status_of(finding(support=wanted, correlation=correlation), guess=guess)[0] is Status.CONVERGED
 
 
-@pytest.mark.parametrize(("guess", "least"), [(True, 0.8), (False, 0.0)])
+@pytest.mark.parametrize(("guess", "least"), [(True, SETTINGS.guess_correlation), (False, SETTINGS.min_correlation)])
 def test_brightness_that_disagrees_is_a_doubt(guess, least):
     status, reason = status_of(finding(correlation=least - 0.19), guess=guess)
     assert status is Status.POOR_FIT
@@ -127,7 +132,7 @@ def test_relative_uncertainty_is_a_share_of_the_range():
 
 
 WORSE = {
-    "less precise": {"covariance": 64 * SMALL},
+    "less precise": {"covariance": 225 * SMALL},
     "brightness agrees less": {"correlation": 0.6},
     "fewer components with a partner": {"support": 0.3},
 }
