@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 
+from garps_core.config import PRESETS
 from garps_ros.parameters import Parameter, Value, parameters
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,7 +26,7 @@ GROUPS = {
     "alignment": ("`alignment`", "The objective and how it is maximised; what a pose must hold to be published."),
     "": ("The estimator as a whole", "Where and in which arithmetic it runs."),
 }
-OTHER_PRESETS = ("monocular", "paper")
+OTHER_PRESETS = tuple(name for name in PRESETS if name not in ("default", "sensor"))
 INDENT = " " * 4
 
 INTRODUCTION = """\
@@ -36,9 +37,10 @@ Generated from the settings in `garps_ros/settings.py` and `garps_core/config.py
 
 `pose_node` has two kinds of parameters: its own, and every setting of the estimator under the name it has everywhere
 else (`lifting.stride` here is `--set lifting.stride=4` of `garps-replay`). `preset` chooses the values that the
-estimator's settings start from: `default` and `sensor` (the same today) for measured depth, `monocular` for a
-network's depth, `paper` for the published method. A single setting given beside it stands above the preset. The
-annealing ladder is a table and no parameter; it comes with the preset.
+estimator's settings start from: `default` and `sensor` (the same today) for measured depth, `time_of_flight`,
+`structured_light` and `stereo` for depth of that kind, `monocular` for a network's depth, `paper` for the published
+method. A single setting given beside it stands above the preset. The annealing ladders are tables and no parameters;
+they come with the preset.
 
 ## Setting them
 

@@ -42,7 +42,7 @@ NODE_NAMES = tuple(f.name for f in dataclasses.fields(NodeSettings))
 def parameters(preset: str = "default") -> list[Parameter]:
     """The node's own parameters, then the estimator's with the values of `preset` as defaults.
 
-    `alignment.ladder` is none of them: a table, it comes with the preset. Raises ConfigError on an unknown preset.
+    The alignment's ladders are none of them: tables, they come with the preset. Raises ConfigError on another preset.
     """
     own = NodeSettings(preset=preset)
     return [*_described("", own), *_described("", Config.preset(own.preset))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from garps_core.config import PRESETS
 from garps_core.described import Checked, setting
 from garps_core.errors import ConfigError
 
@@ -16,7 +17,7 @@ class NodeSettings(Checked, prefix=""):
     preset: str = setting(
         "default",
         "the estimator's settings to start from",
-        choices=("default", "sensor", "monocular", "paper"),
+        choices=tuple(PRESETS),
         live=False,
     )
     pairing: str = setting(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from garps_core.config import Config
+from garps_core.config import PRESETS, Config
 from garps_core.described import Checked, setting
 from garps_core.errors import ConfigError
 from garps_ros import parameter_docs
@@ -19,7 +19,7 @@ from garps_ros.settings import NodeSettings
 from garps_ros.tracking import KeyframeRule
 
 ROOT = Path(__file__).resolve().parent.parent
-PRESETS = ("default", "sensor", "monocular", "paper")
+LADDERS = ("alignment.ladder", "alignment.search", "alignment.search_ladder")
 
 
 def values_of(preset: str = "default", **changes: object) -> dict[str, object]:
@@ -44,10 +44,10 @@ def test_a_class_chooses_how_errors_name_its_settings() -> None:
         NodeSettings(pairing="x")
 
 
-def test_every_setting_is_a_parameter_except_the_ladder() -> None:
+def test_every_setting_is_a_parameter_except_the_ladders() -> None:
     names = [parameter.name for parameter in parameters()]
     own = [f.name for f in dataclasses.fields(NodeSettings)]
-    assert names == own + [name for name in Config().settings() if name != "alignment.ladder"]
+    assert names == own + [name for name in Config().settings() if name not in LADDERS]
     assert names[0] == "preset" and len(names) == len(set(names))
 
 
@@ -55,7 +55,7 @@ def test_every_setting_is_a_parameter_except_the_ladder() -> None:
 def test_the_defaults_are_those_of_the_preset(preset: str) -> None:
     declared = {parameter.name: parameter.default for parameter in parameters(preset)}
     config = Config.preset(preset)
-    assert {name: value for name, value in config.settings().items() if name != "alignment.ladder"}.items() <= (
+    assert {name: value for name, value in config.settings().items() if name not in LADDERS}.items() <= (
         declared.items()
     )
     assert settings_from(declared) == (NodeSettings(preset=preset), config)
@@ -121,7 +121,7 @@ def test_values_reach_the_settings() -> None:
 
 WRONG = {
     "choice": ({"pairing": "x"}, "pairing is 'x': expected one of cameras, keyframe"),
-    "preset": ({"preset": "x"}, "preset is 'x': expected one of default, sensor, monocular, paper"),
+    "preset": ({"preset": "x"}, "preset is 'x': expected one of default, sensor, time_of_flight"),
     "range": ({"sync_slop": 11.0}, "sync_slop is 11.0: expected between 0 and 10 s"),
     "range of the estimator": ({"lifting__stride": 0}, "lifting.stride is 0: expected between 1 and 32 px"),
     "frame in itself": (
@@ -202,7 +202,9 @@ def test_the_page_has_a_row_for_every_parameter() -> None:
     assert [row.split("`")[1] for row in rows] == [parameter.name for parameter in parameters()]
     assert all(row.count(" | ") == 6 for row in rows)
     (row,) = [row for row in rows if "`lifting.noise_linear`" in row]
-    expected = "| `lifting.noise_linear` | double | `0.001`; monocular `0.05` | 0.0 .. 1.0 | m/m | yes | depth noise"
+    expected = (
+        "| `lifting.noise_linear` | double | `0.003`; time_of_flight `0.001`; structured_light `0.0`; stereo `0.0`;"
+    )
     assert row.startswith(expected)
     (row,) = [row for row in rows if "`alignment.max_prior_sigmas`" in row]
     assert "`8.0`; paper `1000000.0`" in row
