@@ -73,9 +73,9 @@ def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) 
     return best
 
 
-def _merit(estimate: PoseEstimate) -> tuple[bool, bool, float]:
-    """Order of preference: a pose to use, then any pose, then quality."""
-    return estimate.ok, estimate.T_target_source is not None, estimate.quality
+def _merit(estimate: PoseEstimate) -> tuple[bool, float]:
+    """Order of preference: any pose, then quality; a status alone may look content with a wrong optimum."""
+    return estimate.T_target_source is not None, estimate.quality
 
 
 def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:

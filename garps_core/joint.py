@@ -63,8 +63,8 @@ def evaluate_jointly(pairs: Pairs, T: Array, of_rows: Array, of_partners: Array)
         torch.as_tensor(part, dtype=own.dtype, device=own.device)
         for part in (T[:3, :3], T[:3, 3], of_rows, of_partners)
     )
-    arm = (own * (1 + rows_modes @ by_rows)[:, None]) @ R.T
-    there = arm + t
+    arm = own @ R.T
+    there = arm * (1 + rows_modes @ by_rows)[:, None] + t
     partner_modes = depth_modes(there)
     mu = there * (1 - partner_modes @ by_partners)[:, None]
     _, S = moved_rows(pairs, T)

@@ -19,7 +19,7 @@ from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, point_jacobian, project, se3_exp, se3_inverse, transform
-from garps_core.reconstruct import averaged_sigma
+from garps_core.reconstruct import depth_sigma
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
@@ -29,6 +29,8 @@ MIN_PIXEL_SIGMA = 0.3
 HUBER = 2.0
 """Residuals beyond this many sigmas count with their length, not its square."""
 REFINEMENT_STEPS = 8
+PATCH_AVERAGE = 3.0
+"""The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
 
 Bool = npt.NDArray[np.bool_]
 
@@ -117,7 +119,8 @@ def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Liftin
     D[:, 1, 1], D[:, 1, 2] = way.K[1, 1] / z, -way.K[1, 1] * y / z**2
     J = D @ point_jacobian(moved)
     along = D @ (T[:3, :3] @ way.points.T).T[..., None]  # pixels per unit of relative depth
-    relative = averaged_sigma(way.points[:, 2].astype(np.float32), lifting) / np.maximum(way.points[:, 2], 1e-6)
+    sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / PATCH_AVERAGE
+    relative = sigma / np.maximum(way.points[:, 2], 1e-6)
     C = pixel_sigma**2 * np.eye(2) + along @ along.transpose(0, 2, 1) * relative[:, None, None] ** 2
     W = np.linalg.inv(C)
     size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))

@@ -87,7 +87,11 @@ def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
 
 
 def averaged_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """Standard deviation of the depth of a component, m, same shape: the mean of nine readings, unless not smoothed."""
+    """Standard deviation of the depth of a component, m, same shape: a third of one reading's where it is smoothed.
+
+    Calibrated, on real sensors with their documented noise (docs/alignment_notes.md): readings close to each other are
+    averaged, and a row is compared with many partners.
+    """
     return depth_sigma(depth, lifting) / np.float32(3 if lifting.smoothing_px > 1 else 1)
 
 

@@ -131,7 +131,6 @@ def test_pose_from_monocular_depth():
     assert np.trace(estimate.covariance[:3, :3]) < 0.9 * np.trace(believed.covariance[:3, :3]), "brightness sharpens"
 
 
-@pytest.mark.xfail(strict=True, reason="a search from identity that calls itself converged replaces a better pose")
 def test_depth_that_is_worse_than_the_settings_say_gives_no_wrong_pose():
     """A network's depth taken for a sensor's: from features the fit is poor, and no other start does better.
 
