@@ -69,13 +69,15 @@ def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) 
     may_search = config.start.method == "auto" and config.start.identity_fallback
     if not best.ok and may_search and starts[0].origin == "features":
         reason = f"from features: {best.status.value}, {best.reason}"
-        best = max(best, align_mixtures(x, y, identity(config, reason), config), key=_merit)
+        other = align_mixtures(x, y, identity(config, reason), config)
+        if not other.agreement < best.agreement:  # content with its own optimum is not enough
+            best = max(best, other, key=_merit)
     return best
 
 
-def _merit(estimate: PoseEstimate) -> tuple[bool, float]:
-    """Order of preference: any pose, then quality; a status alone may look content with a wrong optimum."""
-    return estimate.T_target_source is not None, estimate.quality
+def _merit(estimate: PoseEstimate) -> tuple[bool, bool, float]:
+    """Order of preference: a pose to use, then any pose, then quality."""
+    return estimate.ok, estimate.T_target_source is not None, estimate.quality
 
 
 def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:
@@ -154,6 +156,7 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         best.solution.iterations,
         best.solution.data.value,
         quality(best, guess),
+        float("nan") if best.seen is None else best.merit,
     )
 
 

@@ -27,6 +27,8 @@ def as_json(estimate: PoseEstimate) -> dict[str, Any]:
             **_pose_json(initial.T_target_source, initial.covariance),
         },
         "overlap": float(estimate.overlap),
+        "quality": float(estimate.quality),
+        "agreement": float(estimate.agreement) if np.isfinite(estimate.agreement) else None,
         "iterations": int(estimate.iterations),
         "objective": float(estimate.objective) if np.isfinite(estimate.objective) else None,
         "seconds": {name: float(value) for name, value in estimate.seconds.items()},
@@ -65,7 +67,7 @@ def as_text(estimate: PoseEstimate) -> str:
     if estimate.initial is not None:
         why = f" ({estimate.initial.reason})" if estimate.initial.reason else ""
         lines.append(f"start        {estimate.initial.origin}{why}")
-    lines.append(f"overlap      {100 * estimate.overlap:.0f} %")
+    lines.append(f"overlap      {100 * estimate.overlap:.0f} %, quality {estimate.quality:.2f} of 1")
     spent = ", ".join(f"{name} {value:.2f} s" for name, value in estimate.seconds.items())
     lines.append(f"time         {spent} ({estimate.iterations} iterations)")
     return "\n".join(lines)

@@ -154,6 +154,8 @@ class PoseEstimate:
     """Final value of the objective; comparable only between runs on the same mixtures and Config."""
     quality: float = 0.0
     """How likely the pose is right to 5 cm and 2 deg, 0..1, from its covariance and fit: to gate on and to rank by."""
+    agreement: float = float("nan")
+    """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: reconstruct, initialise, align."""
 

@@ -37,6 +37,7 @@ class Row:
     T_target_source: Float64Array | None = None
     covariance: Float64Array | None = None
     segment: int = 0
+    quality: float | None = None
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ def _topic_name(frame: Frame) -> str:
 
 def _row(stamps: tuple[int, int], names: tuple[str, str], segment: int, found: PoseEstimate) -> Row:
     pose = found.T_target_source, found.covariance
-    return Row(*stamps, *names, found.status.value, found.reason, found.overlap, *pose, segment)
+    return Row(*stamps, *names, found.status.value, found.reason, found.overlap, *pose, segment, found.quality)
 
 
 def _failed(stamps: tuple[int, int], names: tuple[str, str], segment: int, error: Exception) -> Row:

@@ -163,6 +163,7 @@ class PoseNode:
         self._health.facts["frames"] = f"{outcome.child_frame_id} in {outcome.frame_id}"
         if outcome.row.overlap is not None:
             self._health.facts["overlap"] = f"{outcome.row.overlap:.2f}"
+            self._health.facts["quality"] = f"{outcome.row.quality or 0:.2f}"
         if outcome.T is None or outcome.covariance is None:
             self._reject(outcome.row.status, outcome.row.reason)
             return

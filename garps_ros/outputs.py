@@ -27,7 +27,7 @@ UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 POSE_COLUMNS = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 COLUMNS = [
     *("pair", "segment", "source_stamp_ns", "target_stamp_ns", "source_frame", "target_frame", "status", "reason"),
-    *("overlap", *POSE_COLUMNS, *(f"c{i}{j}" for i, j in UPPER)),
+    *("overlap", "quality", *POSE_COLUMNS, *(f"c{i}{j}" for i, j in UPPER)),
 ]
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (s, m, unit quaternion)\n"
 
@@ -75,9 +75,9 @@ class Outputs:
         pose = ["" for _ in POSE_COLUMNS] if row.T_target_source is None else self._pose_text(row.T_target_source)
         C = row.covariance
         upper = ["" if C is None else f"{C[i, j]:.9e}" for i, j in UPPER]
-        overlap = "" if row.overlap is None else f"{row.overlap:.6f}"
+        merits = ["" if merit is None else f"{merit:.6f}" for merit in (row.overlap, row.quality)]
         stamps = (row.source_stamp_ns, row.target_stamp_ns, row.source_frame, row.target_frame)
-        self._csv.writerow([self._rows, row.segment, *stamps, row.status, row.reason, overlap, *pose, *upper])
+        self._csv.writerow([self._rows, row.segment, *stamps, row.status, row.reason, *merits, *pose, *upper])
         self._rows += 1
         self._csv_file.flush()
 

@@ -74,7 +74,7 @@ Every camera needs depth registered to its image.
 \b
 Writes into --out:
   trajectory.tum  stamp, position, quaternion of the poses that can be used; frames in its first line
-  poses.csv       every pair, also rejected ones, with status, reason, pose, covariance and overlap
+  poses.csv       every pair, also rejected ones, with status, reason, overlap, quality, pose, covariance
   poses/          rosbag2 (MCAP) with /garps/pose and /garps/odometry
 \b
 With --to-ros nothing is estimated or written: the recording is played into a live ROS 2 graph, with /clock for nodes

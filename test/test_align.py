@@ -33,7 +33,7 @@ PUBLIC = {
     "InputError": None,
     "Mixture": ["means", "covariances", "weights", "colours", "labels", "frustum"],
     "PoseEstimate": [
-        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality",
+        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality", "agreement",
         "seconds",
     ],
     "Prior": ["T_target_source", "covariance", "origin", "reason"],
