@@ -33,8 +33,8 @@ PUBLIC = {
     "InputError": None,
     "Mixture": ["means", "covariances", "weights", "colours", "labels", "frustum"],
     "PoseEstimate": [
-        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality", "agreement",
-        "seconds",
+        "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality",
+        "agreement", "seconds",
     ],
     "Prior": ["T_target_source", "covariance", "origin", "reason"],
     "ReconstructionError": None,

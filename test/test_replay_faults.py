@@ -87,4 +87,4 @@ def test_settings_reach_the_estimator(tmp_path, monkeypatch):
     options = [word for change in changes for word in ("--set", change)]
     assert run(bag, tmp_path / "out", "--preset", "monocular", *options) == 0
     assert (seen[0].lifting.stride, seen[0].start.identity_fallback, seen[0].lifting.max_range_m) == (4, False, 7.0)
-    assert seen[0].lifting.noise_linear == 0.05  # of the preset
+    assert seen[0].lifting.noise_linear == 0.03  # of the preset
