@@ -167,10 +167,16 @@ class Solver:
             found = estimate_relative_pose(source, target, self._job.config, self._prior)
         self._result.core_s += time.perf_counter() - began
         if self._prior is not None:
-            given = found.initial is not None and found.initial.origin.startswith("given")
-            self._result.prior = "used" if given else f"not used: start.method is {self._job.config.start.method}"
+            self._result.prior = self._use_of_prior(found)
         self._seen = source, target, found
         return found
+
+    def _use_of_prior(self, found: PoseEstimate) -> str:
+        """What became of the given prior: used, alone or with features, or why not."""
+        method = self._job.config.start.method
+        if found.initial is not None and found.initial.origin.startswith("given"):
+            return "used"
+        return f"not used: start.method is {method}" if method != "auto" else "not used: features contradict it"
 
     def _renamed(self, outcome: Origin | Outcome) -> Origin | Outcome:
         """With the frame names that the settings ask for."""

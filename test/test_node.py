@@ -90,7 +90,7 @@ def test_a_prior_is_used_where_it_belongs(domain, tmp_path):
         peer.wait(lambda: rig.answer() and values(peer, "estimates").get("prior") == "used", what="the prior in use")
         shots, pose, _ = rig.answer()
         given = offline(shots, prior=Prior(*pose_from_message(message)))
-        assert given.initial.origin == "given"
+        assert given.initial.origin == "given and features"
         assert_equal(pose, given)
         message.header.frame_id = "map"
         priors.publish(message)
