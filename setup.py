@@ -47,7 +47,7 @@ setup(
         "torch>=2.1",
         "typer>=0.12",
     ],
-    extras_require={"figure": FIGURE, "test": TEST + FIGURE, "bench": BENCH + FIGURE},
+    extras_require={"fast": ["numba>=0.59"], "figure": FIGURE, "test": TEST + FIGURE, "bench": BENCH + FIGURE},
     entry_points={
         "console_scripts": [
             "garps = garps_core.cli:main",
