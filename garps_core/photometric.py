@@ -67,6 +67,19 @@ class _Grid:
 
 
 @dataclass(frozen=True)
+class _Overlay:
+    """Points of one view that fall on pixels of the other: which, where (m and pixels), and both brightnesses."""
+
+    inside: npt.NDArray[np.bool_]
+    moved: Array
+    pixel: Array
+    own: Array
+    theirs: Array
+    correlation: float
+    share: float
+
+
+@dataclass(frozen=True)
 class _Comparison:
     """Normal equations of one direction over the left twist of the pose that moves its points."""
 
@@ -91,10 +104,12 @@ def sharpen(
     """
     if source.brightness is None or target.brightness is None:
         return None
+    if information <= 0:
+        return _only_compared(source, target, T, covariance)
     precision, at = np.linalg.inv(covariance), T
-    for step in GRIDS if information > 0 else GRIDS[-1:]:
+    for step in GRIDS:
         x, y = _grid(source, step), _grid(target, step)
-        for _ in range(STEPS if information > 0 else 0):
+        for _ in range(STEPS):
             seen = _both(x, y, at)
             if seen is None:
                 break
@@ -115,6 +130,14 @@ def sharpen(
         spread += effect @ effect.T
     agreement = min(f.correlation, b.correlation), min(f.share, b.share)
     return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement)
+
+
+def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array) -> Sharpened | None:
+    x, y = _grid(source, GRIDS[-1]), _grid(target, GRIDS[-1])
+    f, b = _overlaid(x, y, T), _overlaid(y, x, se3_inverse(T))
+    if f is None or b is None:
+        return None
+    return Sharpened(T, covariance, min(f.correlation, b.correlation), min(f.share, b.share))
 
 
 def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:
@@ -161,31 +184,38 @@ def _summed(f: _Comparison, b: _Comparison, T: Array) -> tuple[Array, Array]:
     return f.information + B.T @ b.information @ B, f.gradient + B.T @ b.gradient
 
 
-def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
-    """Points of x against the pixels of y that they fall on; None when too few do, or all look alike."""
+def _overlaid(x: _Grid, y: _Grid, T: Array) -> _Overlay | None:
+    """Points of x on the pixels of y that they fall on; None when too few do, or all look alike."""
     moved = x.points @ T[:3, :3].T + T[:3, 3]
     pixel = _seen_at(moved, y)
     inside = np.isfinite(pixel[:, 0])
     if inside.sum() < MIN_POINTS:
         return None
-    moved, (u, v) = moved[inside], pixel[inside].T
-    theirs, slope_x, slope_y = (_sampled(image, u, v) for image in (y.image, y.slope_x, y.slope_y))
-    own = x.brightness[inside]
+    own, theirs = x.brightness[inside], _sampled(y.image, *pixel[inside].T)
     if min(np.std(own), np.std(theirs)) < MIN_CONTRAST:
         return None
-    exposure = np.stack([own, np.ones_like(own)], axis=1)
-    error, weights = _robust(theirs, exposure)
-    z = moved[:, 2]
+    correlation = float(np.corrcoef(own, theirs)[0, 1])
+    return _Overlay(inside, moved[inside], pixel[inside], own, theirs, correlation, float(inside.mean()))
+
+
+def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
+    """Normal equations of the points of x against the pixels of y; None when too little can be compared."""
+    seen = _overlaid(x, y, T)
+    if seen is None:
+        return None
+    slope_x, slope_y = (_sampled(image, *seen.pixel.T) for image in (y.slope_x, y.slope_y))
+    exposure = np.stack([seen.own, np.ones_like(seen.own)], axis=1)
+    error, weights = _robust(seen.theirs, exposure)
+    z = seen.moved[:, 2]
     a, b = slope_x * y.K[0, 0] / z, slope_y * y.K[1, 1] / z
-    slope = np.stack([a, b, -(a * moved[:, 0] + b * moved[:, 1]) / z], axis=1)  # brightness per metre
-    J = np.concatenate([slope, np.cross(moved, slope)], axis=1)
+    slope = np.stack([a, b, -(a * seen.moved[:, 0] + b * seen.moved[:, 1]) / z], axis=1)  # brightness per metre
+    J = np.concatenate([slope, np.cross(seen.moved, slope)], axis=1)
     weighted = exposure * weights[:, None]
     J = J - exposure @ np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ J)  # exposure is free
     JW = (J * weights[:, None]).T
-    fields = T[:3, :3] @ shared_errors(x.points[inside])
+    fields = T[:3, :3] @ shared_errors(x.points[seen.inside])
     of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
-    correlation = float(np.corrcoef(own, theirs)[0, 1])
-    return _Comparison(JW @ J, -JW @ error, of_depth, correlation, float(inside.mean()))
+    return _Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
 
 
 def _seen_at(moved: Array, y: _Grid) -> Array:

@@ -377,9 +377,9 @@ def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
 
 
-def test_a_prior_that_the_start_method_ignores_is_not_called_used(monkeypatch):
+def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch):
     answering(monkeypatch, recordings.estimate)
-    assert solve(*pair(), prior=given("target_optical")).prior == "not used: start.method is auto"
+    assert solve(*pair(), prior=given("target_optical")).prior == "not used: features contradict it"
 
 
 def test_frame_names_that_cannot_be_right_are_doubted(calls):
