@@ -26,7 +26,7 @@ WORKDIR /ws
 RUN python3 -m venv --system-site-packages venv && touch venv/COLCON_IGNORE
 COPY setup.py setup.cfg pyproject.toml package.xml requirements-numpy1.txt needs/
 COPY resource needs/resource
-RUN venv/bin/pip install -c needs/requirements-numpy1.txt "setuptools<80" ./needs \
+RUN venv/bin/pip install -c needs/requirements-numpy1.txt "setuptools<80" "./needs[fast]" \
  && venv/bin/pip uninstall -y garps_ros \
  && rm -rf needs
 

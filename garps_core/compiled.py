@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The same arithmetic as `objective.py` and `pairing.py` in compiled loops, used on a CPU when numba is installed.
 
-Nothing here decides anything: every function has a torch or SciPy counterpart beside its caller, which runs without
-numba, on CUDA and in float64, and gives the same numbers to 1e-5 (`test/test_compiled.py`). Loops release the
-interpreter, so that both directions of an alignment run at once. numba keeps the machine code beside this file, or in
-the user's cache, so only the very first call waits for the compiler.
-
-How they are fast: one flat scratch array with constant offsets in the pair loop lets the compiler see that nothing
-overlaps, so it works on 8 or 16 rows at a time; the exponential is a polynomial it can do the same with.
+Nothing here decides anything: every function has a torch or SciPy counterpart beside its caller, which gives the same
+numbers to 1e-5 (`test/test_compiled.py`). Loops release the interpreter, so that both directions run at once. One flat
+scratch array with constant offsets lets the compiler see that nothing overlaps, so it works on 8 or 16 rows at a time.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 try:
     import numba
-except ImportError:  # optional: pip install garps[fast]
+except ImportError:  # optional: pip install ".[fast]"
     numba = None
 
 AVAILABLE = numba is not None
@@ -67,11 +63,10 @@ def exponential(x: np.float32) -> np.float32:
 def row_sums(
     mu: Float32, S: Float32, partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32
 ) -> Float32:
-    """(16, n) sums of `objective._row_sums`: mu (3, n), S (6, n), (3, k, n), (6, k, n), (k, n), (n,)."""
-    k, n = log_weights.shape
+    """(16, n) sums of `objective.row_sums`: mu (3, n), S (6, n), (3, k, n), (6, k, n), (k, n), (n,)."""
+    n = log_weights.shape[1]
     out = np.empty((16, n), np.float32)
-    w = np.empty(20 * ROWS, np.float32)  # planes: 0 mu, 3 S, 9 floor, 10 d, 13 S + S_j, 19 logarithm of the weight
-    total = np.empty(16 * ROWS, np.float32)
+    w, total = np.empty(20 * ROWS, np.float32), np.empty(16 * ROWS, np.float32)
     for begin in range(0, n, ROWS):
         rows = min(ROWS, n - begin)
         for plane in range(3):
@@ -80,26 +75,78 @@ def row_sums(
         for plane in range(6):
             for r in range(rows):
                 w[(3 + plane) * ROWS + r] = S[plane, begin + r]
-        for r in range(rows):
-            w[9 * ROWS + r] = floor[begin + r]
-        total[:] = 0
-        for j in range(k):
-            for plane in range(3):
-                from_plane = partners[plane, j]
-                for r in range(rows):
-                    w[(10 + plane) * ROWS + r] = w[plane * ROWS + r] - from_plane[begin + r]
-            for plane in range(6):
-                from_plane = covariances[plane, j]
-                for r in range(rows):
-                    w[(13 + plane) * ROWS + r] = w[(3 + plane) * ROWS + r] + from_plane[begin + r]
-            weights = log_weights[j]
-            for r in range(rows):
-                w[19 * ROWS + r] = weights[begin + r] - w[9 * ROWS + r]
-            _add_partner(w, total, rows)
+        _sum_partners(w, total, begin, rows, partners, covariances, log_weights, floor)
         for plane in range(16):
             for r in range(rows):
                 out[plane, begin + r] = total[plane * ROWS + r]
     return out
+
+
+@loop
+def evaluated(
+    means: Float32, own: Float32, R: Float32, t: Float32, turn: Float32, weights: Float32,
+    partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32,
+) -> tuple[float, float, Float64, Float64]:  # fmt: skip
+    """The "log" objective in one pass: value, support, and (10, 15) and (6, 6) of `moments`.
+
+    means (n, 3), own covariances (n, 6) of the rows before the pose (R, t); turn (6, 6): R on packed covariances.
+    """
+    n = len(means)
+    w, total = np.empty(20 * ROWS, np.float32), np.empty(16 * ROWS, np.float32)
+    v, missing = np.empty(31 * ROWS), np.empty(ROWS)
+    out, turning = np.zeros((10, 15)), np.zeros((6, 6))
+    value = support = 0.0
+    for begin in range(0, n, ROWS):
+        rows = min(ROWS, n - begin)
+        for plane in range(3):
+            for r in range(rows):
+                x, y, z = means[begin + r, 0], means[begin + r, 1], means[begin + r, 2]
+                w[plane * ROWS + r] = R[plane, 0] * x + R[plane, 1] * y + R[plane, 2] * z + t[plane]
+        for plane in range(6):
+            for r in range(rows):
+                turned = np.float32(0)
+                for element in range(6):
+                    turned += turn[plane, element] * own[begin + r, element]
+                w[(3 + plane) * ROWS + r] = turned
+        _sum_partners(w, total, begin, rows, partners, covariances, log_weights, floor)
+        for r in range(rows):
+            s, weight = np.float64(total[r]), np.float64(weights[begin + r])
+            value += weight * np.log1p(s)
+            c = weight / (1 + s)
+            support += c * s
+            for plane in range(15):
+                v[(10 + plane) * ROWS + r] = total[(1 + plane) * ROWS + r] * c
+            missing[r] = 1 / max(weight, 1e-300)
+        for plane in range(6):
+            for r in range(rows):
+                v[(25 + plane) * ROWS + r] = w[(3 + plane) * ROWS + r]
+        _set_powers(v, w, rows)
+        _add_moments(v, missing, rows, out, turning)
+    return value, support, out, turning
+
+
+@loop
+def _sum_partners(
+    w: Float32, total: Float32, begin: int, rows: int,
+    partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32,
+) -> None:  # fmt: skip
+    """Fill `total` for one block of rows; planes of w: 0 mu, 3 S, 9 floor, 10 d, 13 S + S_j, 19 log weight."""
+    for r in range(rows):
+        w[9 * ROWS + r] = floor[begin + r]
+    total[:] = 0
+    for j in range(log_weights.shape[0]):
+        for plane in range(3):
+            from_plane = partners[plane, j]
+            for r in range(rows):
+                w[(10 + plane) * ROWS + r] = w[plane * ROWS + r] - from_plane[begin + r]
+        for plane in range(6):
+            from_plane = covariances[plane, j]
+            for r in range(rows):
+                w[(13 + plane) * ROWS + r] = w[(3 + plane) * ROWS + r] + from_plane[begin + r]
+        weights = log_weights[j]
+        for r in range(rows):
+            w[19 * ROWS + r] = weights[begin + r] - w[9 * ROWS + r]
+        _add_partner(w, total, rows)
 
 
 @loop
@@ -151,47 +198,65 @@ def _add_partner(w: Float32, total: Float32, rows: int) -> None:
 
 @loop
 def moments(c: Float64, missing: Float64, sums: Float32, mu: Float32, S: Float32) -> tuple[Float64, Float64]:
-    """(10, 15) moments and (6, 6) turning of `objective._combine`.
+    """(10, 15) moments and (6, 6) turning of `objective.combine`.
 
     c (n,) multiplies the sums; missing (n,) multiplies the outer product of a row's own u, 0 for the "sum" form.
     """
     n = len(c)
     out, turning = np.zeros((10, 15)), np.zeros((6, 6))
-    w = np.empty(31 * ROWS)  # planes: 0 powers of mu, 10 u, 13 S^-1, 19 what is missing, 25 S
+    w, v = np.empty(3 * ROWS, np.float32), np.empty(31 * ROWS)
     for begin in range(0, n, ROWS):
         rows = min(ROWS, n - begin)
-        for r in range(rows):
-            x, y, z = np.float64(mu[0, begin + r]), np.float64(mu[1, begin + r]), np.float64(mu[2, begin + r])
-            w[r], w[ROWS + r], w[2 * ROWS + r], w[3 * ROWS + r] = 1.0, x, y, z
-            w[4 * ROWS + r], w[5 * ROWS + r], w[6 * ROWS + r] = x * x, x * y, x * z
-            w[7 * ROWS + r], w[8 * ROWS + r], w[9 * ROWS + r] = y * y, y * z, z * z
+        for plane in range(3):
+            for r in range(rows):
+                w[plane * ROWS + r] = mu[plane, begin + r]
         for plane in range(15):
             for r in range(rows):
-                w[(10 + plane) * ROWS + r] = sums[1 + plane, begin + r] * c[begin + r]
+                v[(10 + plane) * ROWS + r] = sums[1 + plane, begin + r] * c[begin + r]
         for plane in range(6):
             for r in range(rows):
-                w[(25 + plane) * ROWS + r] = S[plane, begin + r]
-        for a in range(6):
-            for b in range(6):
-                s = 0.0
-                for r in range(rows):
-                    s += w[(25 + a) * ROWS + r] * (w[(19 + b) * ROWS + r] - w[(13 + b) * ROWS + r])
-                turning[a, b] += s
-        for r in range(rows):
-            u0, u1, u2, q = w[10 * ROWS + r], w[11 * ROWS + r], w[12 * ROWS + r], missing[begin + r]
-            w[19 * ROWS + r] -= q * u0 * u0
-            w[20 * ROWS + r] -= q * u0 * u1
-            w[21 * ROWS + r] -= q * u0 * u2
-            w[22 * ROWS + r] -= q * u1 * u1
-            w[23 * ROWS + r] -= q * u1 * u2
-            w[24 * ROWS + r] -= q * u2 * u2
-        for a in range(10):
-            for b in range(15):
-                s = 0.0
-                for r in range(rows):
-                    s += w[a * ROWS + r] * w[(10 + b) * ROWS + r]
-                out[a, b] += s
+                v[(25 + plane) * ROWS + r] = S[plane, begin + r]
+        _set_powers(v, w, rows)
+        _add_moments(v, missing[begin : begin + rows], rows, out, turning)
     return out, turning
+
+
+@loop
+def _set_powers(v: Float64, w: Float32, rows: int) -> None:
+    """Planes 0..9 of v: 1, mu and the products of mu, which is planes 0..2 of w."""
+    for r in range(rows):
+        x, y, z = np.float64(w[r]), np.float64(w[ROWS + r]), np.float64(w[2 * ROWS + r])
+        v[r], v[ROWS + r], v[2 * ROWS + r], v[3 * ROWS + r] = 1.0, x, y, z
+        v[4 * ROWS + r], v[5 * ROWS + r], v[6 * ROWS + r] = x * x, x * y, x * z
+        v[7 * ROWS + r], v[8 * ROWS + r], v[9 * ROWS + r] = y * y, y * z, z * z
+
+
+@loop
+def _add_moments(v: Float64, missing: Float64, rows: int, out: Float64, turning: Float64) -> None:
+    """Add one block's S (planes 25..30) times (u u' - S^-1), and planes 0..9 times u, S^-1 and what is missing.
+
+    Planes 10..12 hold u, 13..18 S^-1, 19..24 u u', from which the outer product of the row's own u is then taken away.
+    """
+    for a in range(6):
+        for b in range(6):
+            s = 0.0
+            for r in range(rows):
+                s += v[(25 + a) * ROWS + r] * (v[(19 + b) * ROWS + r] - v[(13 + b) * ROWS + r])
+            turning[a, b] += s
+    for r in range(rows):
+        u0, u1, u2, q = v[10 * ROWS + r], v[11 * ROWS + r], v[12 * ROWS + r], missing[r]
+        v[19 * ROWS + r] -= q * u0 * u0
+        v[20 * ROWS + r] -= q * u0 * u1
+        v[21 * ROWS + r] -= q * u0 * u2
+        v[22 * ROWS + r] -= q * u1 * u1
+        v[23 * ROWS + r] -= q * u1 * u2
+        v[24 * ROWS + r] -= q * u2 * u2
+    for a in range(10):
+        for b in range(15):
+            s = 0.0
+            for r in range(rows):
+                s += v[a * ROWS + r] * v[(10 + b) * ROWS + r]
+            out[a, b] += s
 
 
 @loop

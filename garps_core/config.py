@@ -108,7 +108,7 @@ class Alignment(Checked):
         Rung(30.0, 2000, 15, 8),
         Rung(10.0, 3000, 12, 8),
         Rung(4.0, 4000, 12, 8),
-        Rung(2.0, 8000, 12, 20),
+        Rung(2.0, 5000, 12, 20),
     )
     search: tuple[Rung, ...] = (Rung(1000.0, 400, 40, 8, 0.3, 1e-4, 100.0),)
     search_ladder: tuple[Rung, ...] = (
@@ -118,7 +118,7 @@ class Alignment(Checked):
         Rung(30.0, 2000, 15, 8),
         Rung(10.0, 3000, 12, 8),
         Rung(4.0, 4000, 12, 8),
-        Rung(2.0, 8000, 12, 20),
+        Rung(2.0, 5000, 12, 20),
     )
     search_followed: int = setting(4, "how many beginnings of a search are followed to the end", low=1, high=100)
     partner_density: float = setting(

@@ -22,6 +22,7 @@ OPTIONAL = {
     "rclpy": "ROS 2 nodes; comes with ROS",
     "rosbags": "garps-replay",
     "matplotlib": "--figure",
+    "numba": "speed: compiled loops",
 }
 DISTRIBUTIONS = {"cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python")}
 

@@ -79,6 +79,8 @@ class Evaluation:
 
 def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     """Evaluate the objective `form` ("log" or "sum") of `pairs` at the 4x4 pose T that moves the rows."""
+    if form == "log" and on_compiled_path(pairs.means):
+        return _evaluated(pairs, T)
     mu, S = moved_rows(pairs, T)
     sums = row_sums(pairs, mu, S)
     weights, s = pairs.weights.double(), sums[0].double()
@@ -89,6 +91,20 @@ def evaluate(pairs: Pairs, T: Array, form: str) -> Evaluation:
     total = (weights * s).sum()
     value = float(torch.log(total)) if float(total) > 0 else -np.inf
     return Evaluation(value, *combine(weights / total.clamp_min(1e-300), sums, mu, S, None), 1.0)
+
+
+def _evaluated(pairs: Pairs, T: Array) -> Evaluation:
+    """The "log" objective on the compiled path, in one pass."""
+    R, t, turn = (part.astype(np.float32) for part in (T[:3, :3], T[:3, 3], _packed_rotation(T[:3, :3])))
+    rows = (pairs.means, pairs.covariances, pairs.weights)
+    partners = (pairs.partner_means, pairs.partner_covariances, pairs.log_weights, pairs.log_floor)
+    means, own, weights = (part.contiguous().numpy() for part in rows)
+    value, support, moments, turning = compiled.evaluated(
+        means, own, R, t, turn, weights, *(part.contiguous().numpy() for part in partners)
+    )
+    information = _through_jacobian(moments[:, 3:9])
+    observed = information - _through_jacobian(moments[:, 9:])
+    return Evaluation(value, _gradient(moments[:4, :3], turning), information, observed, support)
 
 
 def row_information(pairs: Pairs, T: Array) -> tuple[Array, Array]:

@@ -5,9 +5,8 @@
     covariance  = footprint of the pixel spacing on the surface + depth uncertainty along the ray
     weight      = surface area the pixel stands for, so that near and flat-on surfaces are not counted more often
 
-The same code serves a depth sensor (sigma a few mm) and a depth network (sigma a few per cent of the range): only
-the noise model in `Lifting` differs. A long sigma along the ray is what makes the alignment behave like
-reprojection for monocular depth and like surface matching for a sensor.
+The same code serves a depth sensor and a depth network: only the noise model in `Lifting` differs. What a whole depth
+map gets wrong is not in the components; the alignment knows of it (`systematic.py`, `joint.py`).
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class Status(enum.Enum):
     MAX_ITERATIONS = "max_iterations"  #: a pose is given, the last step was still larger than the tolerance
     DEGENERATE = "degenerate"  #: a pose is given, but the views leave a direction open; see the covariance
     INCONSISTENT = "inconsistent"  #: the data pulls further from the initial pose than its covariance allows
-    POOR_FIT = "poor_fit"  #: too few components found a partner: most likely a wrong local optimum; a pose is given
+    POOR_FIT = "poor_fit"  #: too few partners, or brightness disagrees: most likely a wrong optimum; a pose is given
     LOW_OVERLAP = "low_overlap"  #: too few components of one view are visible in the other
     NO_INITIAL_POSE = "no_initial_pose"  #: nothing to start from
 
