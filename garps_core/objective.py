@@ -38,6 +38,8 @@ NOTHING = -60.0
 SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Order of the six distinct elements of a symmetric 3x3 matrix."""
 _FULL = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_PACKED, _TRANSPOSED = (np.array([3 * pair[a] + pair[1 - a] for pair in SYMMETRIC]) for a in (0, 1))
+_OFF_DIAGONAL = np.array([i != j for i, j in SYMMETRIC])
 _SKEW = np.stack([skew(axis) for axis in np.eye(3)])
 """[mu]x = sum_k mu_k _SKEW[k]."""
 
@@ -126,11 +128,8 @@ def moved_rows(pairs: Pairs, T: Array) -> tuple[Tensor, Tensor]:
 
 def _packed_rotation(R: Array) -> Array:
     """6x6 matrix that takes a packed symmetric S to the packed R S R'."""
-    columns = []
-    for i, j in SYMMETRIC:
-        outer = np.outer(R[:, i], R[:, j])
-        columns.append(outer + outer.T if i != j else outer)
-    return np.stack([[column[i, j] for i, j in SYMMETRIC] for column in columns], axis=1)
+    turned = np.asarray(np.einsum("ac,bd->abcd", R, R).reshape(9, 9)[_PACKED])
+    return np.asarray(turned[:, _PACKED] + np.where(_OFF_DIAGONAL, turned[:, _TRANSPOSED], 0.0))
 
 
 def row_sums(pairs: Pairs, mu: Tensor, S: Tensor) -> Tensor:
@@ -226,6 +225,10 @@ def _vee(M: Array) -> Array:
 
 def _through_jacobian(moments: Array) -> Array:
     """Sum of J' Q J (6, 6), J = [I, -[mu']x], from moments (10, 6) of the packed Q with (1, mu', mu' mu'')."""
+    return (_THROUGH @ moments.reshape(60)).reshape(6, 6)
+
+
+def _through_jacobian_of_one(moments: Array) -> Array:
     full = moments[:, _FULL]  # (10, 3, 3)
     first, second = full[1:4], full[4:][_FULL]
     H = np.empty((6, 6))
@@ -234,6 +237,10 @@ def _through_jacobian(moments: Array) -> Array:
     H[3:, :3] = H[:3, 3:].T
     H[3:, 3:] = np.einsum("kba,klbc,lcd->ad", _SKEW, second, _SKEW)
     return H
+
+
+_THROUGH = np.stack([_through_jacobian_of_one(unit.reshape(10, 6)).ravel() for unit in np.eye(60)], axis=1)
+"""The linear map of `_through_jacobian` as a (36, 60) matrix: an evaluation needs it twice, and einsum is slow."""
 
 
 def pack(S: Tensor) -> Tensor:
