@@ -188,5 +188,4 @@ def test_known_rows_of_peers_are_taken_over():
     assert rows[2] is known["open3d-gicp"]
     assert rows[1]["status"] and "quality" in rows[1]
     disturbed = rgbd.evaluate_pair(Config.preset("monocular"), pair, "disturbed", methods[:2])
-    variants = 2 if rgbd.FEATURES in Config().settings() else 1
-    assert [row["method"] for row in disturbed] == ["(start)", *methods[:variants]]
+    assert [row["method"] for row in disturbed] == ["(start)", *methods[:2]]
