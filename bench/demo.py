@@ -33,7 +33,7 @@ from bench.demo_bag import stamp_ns_of, write_bag
 from bench.demo_picture import with_inputs
 from bench.rooms import RoomPair, make_pair
 from bench.stereo import StereoPair, depth_of_both, load_pairs
-from garps_core import PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
+from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.figure import before_after
 from garps_ros.replay import main as replay
 
@@ -181,11 +181,12 @@ def room_part(out: Path) -> None:
         pair = make_pair(ROOM_SEED, ROOM_LEVEL, depth_noise="sensor")
         views = View(pair.rgb0, pair.K0, pair.depth0), View(pair.rgb1, pair.K1, pair.depth1)
         alone = estimate_relative_pose(*views)
-        rough = estimate_relative_pose(*views, prior=rough_start(pair))
+        by_shape = Config().replace({"start.features": False})  # the picture is of the alignment
+        rough = estimate_relative_pose(*views, by_shape, prior=rough_start(pair))
     length, turn = errors(np.eye(4), pair.T_1_0)
     console.print(f"motion {length / 1000:.2f} m and {turn:.0f} deg, overlap {100 * pair.overlap:.0f} %")
     describe("from the images alone", alone, pair.T_1_0)
-    describe("from a rough pose", rough, pair.T_1_0)
+    describe("from a rough pose, without features", rough, pair.T_1_0)
     if rough.T_target_source is None or rough.initial is None:
         return
     start, end = rough.initial.T_target_source, rough.T_target_source
