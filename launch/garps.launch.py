@@ -41,7 +41,7 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     (
         "preset",
         "",
-        ("", "default", "sensor", "monocular", "paper"),
+        ("", "default", "sensor", "time_of_flight", "structured_light", "stereo", "monocular", "paper"),
         f"estimator settings that the file does not give: sensor depth or a network's; empty: {AS_IN_FILE}",
     ),
     ("target_frame", "", (), "name of the frame the pose is given in; empty: frame_id of the target's images"),
