@@ -113,7 +113,10 @@ def test_a_reset_drops_what_was_being_computed(domain, tmp_path):
             answered = len(rig.odometry)
             peer.spin(0.7)
             assert len(rig.odometry) == answered
-        peer.wait(lambda: count(peer, "estimates", "dropped: stale: reset or settings changed") >= 4, what="drops")
+        # On a loaded machine a pair may come after the reset that was to drop it, wait, and be replaced by the next.
+        kinds = ("dropped: stale: reset or settings changed", "dropped: a newer pair came")
+        peer.wait(lambda: sum(count(peer, "estimates", kind) for kind in kinds) >= 4, what="drops")
+        assert count(peer, "estimates", kinds[0]) >= 2
         assert sum(len(rig.answers(stamp)) for stamp in stamps) <= 1
         rig.answer()
 
