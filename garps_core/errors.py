@@ -20,3 +20,11 @@ class ReconstructionError(GarpsError):
 
 class InitialisationError(GarpsError):
     """No initial pose: too few feature matches fit one pose and no other start is allowed."""
+
+
+class ModelError(GarpsError):
+    """A network or its weights that cannot be used."""
+
+
+class WeightsError(ModelError):
+    """Weights that do not fit the network they were given to."""
