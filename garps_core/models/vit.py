@@ -7,6 +7,7 @@ two-layer network; others read the outputs of some blocks through the final norm
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -207,6 +208,50 @@ def size_of(tensors: Mapping[str, Tensor], prefix: str = "") -> str:
             return name
     known = ", ".join(f"{name} {size.width} x {size.blocks}" for name, size in SIZES.items())
     raise WeightsError(f"a transformer of width {width} with {blocks} blocks: expected one of {known}")
+
+
+_OTHER_NAMES = (
+    (r"^embeddings\.position_embeddings$", "pos_embed"),
+    (r"^embeddings\.(cls_token|mask_token)$", r"\1"),
+    (r"^embeddings\.patch_embeddings\.projection\.", "patch_embed.proj."),
+    (r"^layernorm\.", "norm."),
+    (r"^encoder\.layer\.(\d+)\.(norm1|norm2|mlp\.fc1|mlp\.fc2)\.", r"blocks.\1.\2."),
+    (r"^encoder\.layer\.(\d+)\.mlp\.weights_in\.", r"blocks.\1.mlp.w12."),
+    (r"^encoder\.layer\.(\d+)\.mlp\.weights_out\.", r"blocks.\1.mlp.w3."),
+    (r"^encoder\.layer\.(\d+)\.layer_scale([12])\.lambda1$", r"blocks.\1.ls\2.gamma"),
+    (r"^encoder\.layer\.(\d+)\.attention\.(?:output\.dense|o_proj)\.", r"blocks.\1.attn.proj."),
+    (r"^encoder\.layer\.(\d+)\.attention\.(?:attention\.query|q_proj)\.", r"blocks.\1.attn.q."),
+    (r"^encoder\.layer\.(\d+)\.attention\.(?:attention\.key|k_proj)\.", r"blocks.\1.attn.k."),
+    (r"^encoder\.layer\.(\d+)\.attention\.(?:attention\.value|v_proj)\.", r"blocks.\1.attn.v."),
+)
+
+
+def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of a DINOv2 backbone as the `transformers` library names them -> the same under the official names.
+
+    Queries, keys and values, apart there, are stacked. Raises WeightsError for a name that is not known, or a stack
+    that is not whole.
+    """
+    named = renamed(tensors, _OTHER_NAMES)
+    apart = re.compile(r"\.attn\.[qkv]\.")
+    for stack in dict.fromkeys(apart.sub(".attn.qkv.", name) for name in named if apart.search(name)):
+        parts = [stack.replace(".qkv.", f".{part}.") for part in "qkv"]
+        missing = [part for part in parts if part not in named]
+        if missing:
+            raise WeightsError(f"no {', '.join(missing)} to make {stack} of: the file is damaged or incomplete")
+        named[stack] = torch.cat([named.pop(part) for part in parts])
+    return named
+
+
+def renamed(tensors: Mapping[str, Tensor], names: Iterable[tuple[str, str]]) -> dict[str, Tensor]:
+    """Tensors by the first of (pattern, replacement) that fits their name. Raises WeightsError where none does."""
+    found = {}
+    for key, value in tensors.items():
+        fitting = [re.sub(pattern, other, key) for pattern, other in names if re.search(pattern, key)]
+        if not fitting:
+            raise WeightsError(f"{key} is no name that `transformers` gives to a part of this network: is it another?")
+        found[fitting[0]] = value
+    return found
 
 
 def _some(keys: Iterable[str]) -> str:

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth Anything V2 (Yang et al. 2024), the metric models: one image -> depth along the optical axis, in metres.
+
+A DINOv2 transformer, a dense prediction head, a sigmoid and the largest depth of the training: 20 m (indoor) or 80 m
+(outdoor). The weights do not tell which, nor whether they are a relative model's: the caller says so. The calibration
+does not enter the network, its scale assumes the cameras of the training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from garps_core.checks import Float32Array
+from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
+from garps_core.models import vit
+from garps_core.models.dpt import DptHead, Grid, enlarged
+from garps_core.models.vit import PATCH, SIZES, VisionTransformer
+
+RGBImage = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class HeadSize:
+    """Blocks whose maps the head reads (0-based), channels of its pyramid and of its fusion."""
+
+    taps: tuple[int, int, int, int]
+    channels: tuple[int, int, int, int]
+    features: int
+
+
+HEADS: Mapping[str, HeadSize] = {
+    "vits": HeadSize((2, 5, 8, 11), (48, 96, 192, 384), 64),
+    "vitb": HeadSize((2, 5, 8, 11), (96, 192, 384, 768), 128),
+    "vitl": HeadSize((4, 11, 17, 23), (256, 512, 1024, 1024), 256),
+}
+MAX_DEPTH: Mapping[str, float] = {"indoor": 20.0, "outdoor": 80.0}
+"""Metres, by what the model was trained on: Hypersim (indoor) and Virtual KITTI (outdoor)."""
+SHORT_SIDE = 518
+"""Pixels of the shorter side of the network's input."""
+LONGEST_SIDE = 8 * SHORT_SIDE
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of red, green and blue (0..1) in the training images."""
+TRAINING_FX = 0.5 / np.tan(np.radians(60) / 2)
+"""Focal length over image width of the indoor training's cameras: 60 deg wide."""
+DTYPES = {torch.float32, torch.float16, torch.bfloat16}
+
+
+class DepthAnythingV2(nn.Module):
+    """The metric network of one size (`HEADS`); `state_dict` has the keys of the official files. max_depth: metres."""
+
+    def __init__(self, size: str, max_depth: float) -> None:
+        super().__init__()
+        self.head = HEADS[size]
+        self.max_depth = max_depth
+        self.pretrained = VisionTransformer(SIZES[size])
+        self.depth_head = DptHead(SIZES[size].width, self.head.channels, self.head.features)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W), normalised, sides multiples of 14 -> depth (B, H, W), float32, metres."""
+        logit: Tensor = self.depth_head(self.pretrained(image, self.head.taps))
+        return self.max_depth * logit.squeeze(1).float().sigmoid()
+
+
+def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnythingV2:
+    """The network of the size that the tensors have, with them as its float32 parameters, ready to be used.
+
+    tensors: of an official file or, under the names of `transformers`, of an `-hf` file. max_depth: metres, 20 for
+    indoor and 80 for outdoor weights. Raises ConfigError unless it is positive; WeightsError where tensors are missing,
+    too many or misshaped.
+    """
+    if not (np.isfinite(max_depth) and max_depth > 0):
+        raise ConfigError(
+            f"max_depth = {max_depth:g}: expected metres above 0, {MAX_DEPTH} as the weights were trained"
+        )
+    if any(key.startswith("backbone.") for key in tensors):
+        tensors = from_transformers(tensors)
+    size = vit.size_of(tensors, "pretrained.")
+    if size not in HEADS:
+        raise WeightsError(f"Depth Anything V2 of size {size}: expected one of {', '.join(HEADS)}")
+    with torch.device("meta"):  # nothing is allocated or initialised twice
+        model = DepthAnythingV2(size, max_depth)
+    try:
+        model.load_state_dict(dict(tensors), strict=True, assign=True)
+    except RuntimeError as error:
+        raise WeightsError(f"weights that do not fit Depth Anything V2 {size}: {error}") from None
+    model.float().eval().requires_grad_(False)
+    model.depth_head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return model
+
+
+_OTHER_NAMES = (
+    (r"^neck\.reassemble_stage\.layers\.(\d)\.projection\.", r"projects.\1."),
+    (r"^neck\.reassemble_stage\.layers\.(\d)\.resize\.", r"resize_layers.\1."),
+    *((rf"^neck\.convs\.{i - 1}\.", f"scratch.layer{i}_rn.") for i in (1, 2, 3, 4)),
+    *(
+        (
+            rf"^neck\.fusion_stage\.layers\.{4 - i}\.residual_layer(\d)\.convolution(\d)\.",
+            rf"scratch.refinenet{i}.resConfUnit\1.conv\2.",
+        )
+        for i in (1, 2, 3, 4)
+    ),
+    *(
+        (rf"^neck\.fusion_stage\.layers\.{4 - i}\.projection\.", f"scratch.refinenet{i}.out_conv.")
+        for i in (1, 2, 3, 4)
+    ),
+    (r"^head\.conv1\.", "scratch.output_conv1."),
+    (r"^head\.conv2\.", "scratch.output_conv2.0."),
+    (r"^head\.conv3\.", "scratch.output_conv2.2."),
+)
+
+
+def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors of an `-hf` file, as the `transformers` library names them -> the same under the official names.
+
+    Raises WeightsError for a name that is not known, or an attention that is not whole.
+    """
+    prefix = "backbone."
+    backbone = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+    head = {key: value for key, value in tensors.items() if not key.startswith(prefix)}
+    official = {f"pretrained.{key}": value for key, value in vit.from_transformers(backbone).items()}
+    return official | {f"depth_head.{key}": value for key, value in vit.renamed(head, _OTHER_NAMES).items()}
+
+
+def depth_of(
+    model: DepthAnythingV2,
+    images: Sequence[RGBImage],
+    *,
+    depth_scale: float = 1.0,
+    fx: Sequence[float] | None = None,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> list[Float32Array]:
+    """Depth along the optical axis of each image: HxW float32, metres.
+
+    images: HxWx3 uint8 RGB; those of one network size share one pass. depth_scale: factor on every depth. fx: focal
+    lengths in pixels, one per image, for depth * (fx / W) / (that of the training's cameras), not corrected when None.
+    device: the model is moved there; it stays where it is when None. dtype: of the layers that autocast may compute in
+    less than float32; the sigmoid and the resizes never do.
+    Raises InputError for what is no such image, is smaller than a patch or too elongated; ConfigError for a scale or
+    dtype that cannot be; ModelError when memory does not suffice for one image or the depth is not finite.
+    """
+    if not (np.isfinite(depth_scale) and depth_scale > 0):
+        raise ConfigError(f"depth_scale = {depth_scale:g}: expected a factor above 0, 1 to leave depth as it is")
+    if dtype not in DTYPES:
+        raise ConfigError(f"dtype {dtype}: expected one of {', '.join(sorted(map(str, DTYPES)))}")
+    sizes = [network_size(checked_image(image)) for image in images]
+    scales = np.float32(depth_scale) * _focal_factors(images, fx)
+    if device is not None:
+        model.to(device)
+    found: dict[int, Float32Array] = {}
+    for size in dict.fromkeys(sizes):
+        members = [i for i, own in enumerate(sizes) if own == size]
+        depths = _passed(model, [prepared(images[i], size) for i in members], dtype)
+        for i, depth in zip(members, depths, strict=True):
+            found[i] = scales[i] * _resized_back(depth, images[i].shape[:2])
+    return [found[i] for i in range(len(images))]
+
+
+def checked_image(image: Any) -> RGBImage:
+    """The image itself. Raises InputError unless it is an array HxWx3 of uint8."""
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        told = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise InputError(f"image is {told}: expected an RGB image, HxWx3 uint8")
+    return image
+
+
+def network_size(image: RGBImage) -> Grid:
+    """Rows and columns of the network's input: the shorter side about 518, both multiples of 14.
+
+    Raises InputError for an image smaller than a patch, or so elongated that its longer side would exceed 4144.
+    """
+    height, width = image.shape[:2]
+    if min(height, width) < PATCH:
+        raise InputError(f"image of {width}x{height} pixels: expected at least {PATCH}x{PATCH}, one patch")
+    factor = max(SHORT_SIDE / height, SHORT_SIDE / width)
+    rows, columns = (round(side * factor / PATCH) * PATCH for side in (height, width))
+    if max(rows, columns) > LONGEST_SIDE:
+        raise InputError(
+            f"image of {width}x{height} pixels would enter the network as {columns}x{rows}: expected at most "
+            f"{LONGEST_SIDE} pixels on the longer side, that is {LONGEST_SIDE // SHORT_SIDE} to 1; crop the image"
+        )
+    return rows, columns
+
+
+def prepared(image: RGBImage, size: Grid) -> Tensor:
+    """HxWx3 uint8 RGB -> the network's input (3, *size), float32: cubic resize of 0..1 and normalised, in float64."""
+    resized = cv2.resize(image / 255.0, size[::-1], interpolation=cv2.INTER_CUBIC)
+    normalised = (resized - np.array(MEAN)) / np.array(DEVIATION)
+    return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1), np.float32))
+
+
+def _focal_factors(images: Sequence[RGBImage], fx: Sequence[float] | None) -> Float32Array:
+    """Factor on each image's depth for its focal length in pixels, 1 without one."""
+    if fx is None:
+        return np.ones(len(images), np.float32)
+    if len(fx) != len(images) or not all(np.isfinite(f) and f > 0 for f in fx):
+        raise InputError(f"fx = {list(fx)} for {len(images)} images: expected one positive focal length each, pixels")
+    widths = [image.shape[1] for image in images]
+    return np.array([f / width / TRAINING_FX for f, width in zip(fx, widths, strict=True)], np.float32)
+
+
+def _passed(model: DepthAnythingV2, inputs: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    """Depth (H, W) of each input; in one pass, or one by one where the device's memory does not suffice for that."""
+    device = next(model.parameters()).device
+    try:
+        return list(_pass(model, torch.stack(list(inputs)).to(device), dtype))
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+    try:
+        return [_pass(model, one[None].to(device), dtype)[0] for one in inputs]
+    except torch.cuda.OutOfMemoryError as error:
+        rows, columns = inputs[0].shape[-2:]
+        raise ModelError(
+            f"out of memory on {device} with one image of {columns}x{rows} pixels: expected it to fit; free memory, "
+            f"choose a smaller model or float16, or run on the CPU ({error})"
+        ) from None
+
+
+def _pass(model: DepthAnythingV2, batch: Tensor, dtype: torch.dtype) -> Tensor:
+    """(B, 3, H, W) -> (B, H, W), metres. Raises ModelError where the depth is not finite."""
+    with torch.inference_mode(), torch.autocast(batch.device.type, dtype, enabled=dtype != torch.float32):
+        depth: Tensor = model(batch)
+    if not depth.isfinite().all():
+        raise ModelError(
+            f"the network returned NaN or infinity in {dtype}: expected metres; are the weights damaged, or is "
+            "float32 needed?"
+        )
+    return depth
+
+
+def _resized_back(depth: Tensor, size: Grid) -> Float32Array:
+    """Depth (h, w) at the network's size -> at the image's, corner pixels on corner pixels."""
+    return enlarged(depth[None, None], size)[0, 0].cpu().numpy()
