@@ -15,6 +15,7 @@ def present(pattern: str) -> list[str]:
 
 
 FIGURE = ["matplotlib>=3.6"]
+WEIGHTS = ["huggingface_hub>=0.30"]  # `garps weights fetch` alone needs it; a robot may never go on line
 TEST = ["pytest", "pytest-cov", "hypothesis", "plyfile"]
 BENCH = ["trimesh", "embreex", "open3d-cpu", "small-gicp"]
 
@@ -43,11 +44,18 @@ setup(
         "poselib",
         "rich",
         "rosbags>=0.10",
+        "safetensors>=0.4",
         "scipy>=1.11",
         "torch>=2.1",
         "typer>=0.12",
     ],
-    extras_require={"fast": ["numba>=0.59"], "figure": FIGURE, "test": TEST + FIGURE, "bench": BENCH + FIGURE},
+    extras_require={
+        "fast": ["numba>=0.59"],
+        "figure": FIGURE,
+        "weights": WEIGHTS,
+        "test": TEST + FIGURE + WEIGHTS,
+        "bench": BENCH + FIGURE,
+    },
     entry_points={
         "console_scripts": [
             "garps = garps_core.cli:main",
