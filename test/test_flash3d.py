@@ -281,6 +281,12 @@ def test_only_our_part_of_a_published_file_is_read(state: dict[str, torch.Tensor
     assert left == {f"module.{PREFIX}unidepth": 4, f"module.{PREFIX}encoder": 2, "module": 3}
 
 
+def test_a_file_that_was_cut_down_to_our_part_is_read_too(state: dict[str, torch.Tensor]) -> None:
+    tensors, _ = flash3d_tensors(state)
+    again, left = flash3d_tensors(tensors)
+    assert again.keys() == tensors.keys() and left == {}
+
+
 def test_counters_of_the_training_may_be_absent(state: dict[str, torch.Tensor]) -> None:
     short = {key: value for key, value in state.items() if not key.endswith("num_batches_tracked")}
     assert len(state) - len(short) == 53
@@ -295,5 +301,7 @@ def test_what_is_wrong_with_a_file_is_named(state: dict[str, torch.Tensor]) -> N
         flash3d_tensors({k: v for k, v in state.items() if k != key})
     with pytest.raises(WeightsError, match=r"gauss_decoder_1.out.weight has shape \(14, 32, 1, 1\)"):
         flash3d_tensors({**state, key: torch.zeros(14, 32, 1, 1)})
+    with pytest.raises(WeightsError, match="not finite"):
+        flash3d_network(flash3d_tensors({**state, key: state[key] * torch.inf})[0])
     with pytest.raises(WeightsError, match="expected one; is this the file of Flash3D"):
         flash3d_tensors({"cls_token": torch.zeros(1)})

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.errors import WeightsError
+from garps_core.models.loading import load_strictly
 from garps_core.models.resnet import FEATURE_CHANNELS, ResNet50
 
 LAYERS = 2
@@ -207,10 +208,14 @@ def flash3d_tensors(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dic
 
 
 def flash3d_network(tensors: Mapping[str, Tensor]) -> Flash3D:
-    """The network with what `flash3d_tensors` found, for inference; the tensors are taken over, not copied."""
+    """The network with what `flash3d_tensors` found, float32 on the CPU, for inference.
+
+    Raises WeightsError for tensors that are missing, too many, misshaped or not finite.
+    """
     with torch.device("meta"):
         network = Flash3D()
-    network.load_state_dict(dict(tensors), assign=True)
+    load_strictly(network, tensors, "Flash3D")
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolves faster
     return network.eval().requires_grad_(False)
 
 
