@@ -23,6 +23,7 @@ from garps_core.reconstruct import reconstruct
 from garps_core.report import as_json, as_text
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, Prior, View
+from garps_core.weights_cli import app as weights_app
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
@@ -35,6 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     no_args_is_help=True,
 )
+app.add_typer(weights_app, name="weights")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 """Settings for the whole suite; they must stand before anything imports a message class."""
 
 import os
+import socket
 
 import pytest
 from hypothesis import settings
@@ -14,6 +15,26 @@ os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
 settings.register_profile("garps", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, max_examples=1000)
 settings.load_profile(os.environ.get("GARPS_TEST_PROFILE", "garps"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_network():
+    """Python's sockets reach this machine only: going further fails a test. DDS has its own sockets, in C."""
+    allowed = {"localhost", "127.0.0.1", "::1"}
+    real = {name: getattr(socket.socket, name) for name in ("connect", "connect_ex")}
+
+    def guarded(name):
+        def connect(self, address):
+            if self.family in (socket.AF_INET, socket.AF_INET6) and address[0] not in allowed:
+                raise PermissionError(f"a test went to {address[0]} by network: expected this machine only")
+            return real[name](self, address)
+
+        return connect
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in real:
+            patch.setattr(socket.socket, name, guarded(name))
+        yield
 
 
 @pytest.fixture(scope="module")

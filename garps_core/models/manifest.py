@@ -17,7 +17,7 @@ PERMISSIVE = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 APACHE = "Apache-2.0"
 NON_COMMERCIAL = "CC BY-NC 4.0, non-commercial"
 SHARE_ALIKE = "CC BY-NC-SA 4.0 and the terms of the training data, non-commercial"
-UNLICENSED = "none stated: all rights reserved"
+UNLICENSED = "none stated, all rights reserved"
 
 MAX_DEPTH_M = {"indoor": 20.0, "outdoor": 80.0}
 """Range of the metric Depth Anything networks; their files do not say it."""

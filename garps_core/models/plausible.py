@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Would anybody believe this weights file? Its tensors, and what its network says of one drawn picture.
+
+No test of this repository can see the real weights, so the first person who has them gets a verdict here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from garps_core.checks import Float32Array
+from garps_core.errors import WeightsError
+from garps_core.models.files import Tensors, read_tensors
+from garps_core.models.loading import check_finite, kind_of, load_strictly, recognised
+from garps_core.models.manifest import MAX_DEPTH_M, of_file
+
+Finding = tuple[str, str, bool]
+Picture = npt.NDArray[np.uint8]
+
+LOW_M = 0.2
+"""No depth network for rooms or streets says less of a whole room."""
+SATURATED = 0.98
+"""Share of the largest depth beyond which nearly every pixel of a relative model's output lies."""
+
+
+def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Iterator[Finding]:
+    """Findings (name, words, whether it is good) in order, as they are made.
+
+    Args:
+        path: any weights file.
+        variant: indoor or outdoor, for Depth Anything where neither the file's name nor its metadata says it.
+        kind: the network, see `read_tensors`.
+    Raises:
+        WeightsError: unreadable, not trustworthy, values that are not finite, or tensors that do not fit the network.
+    """
+    known = of_file(path.name)
+    found = read_tensors(path, kind=kind or (known.kind if known else None))
+    yield "sha256", found.sha256, True
+    values = sum(tensor.numel() for tensor in found.tensors.values())
+    yield "tensors", f"{len(found.tensors)}, {values / 1e6:.1f} M values; {recognised(found.tensors)}", True
+    told = kind_of(found.tensors) or (known.kind if known else "")
+    if known is not None:
+        yield "name", f"{known.name}: {known.kind}", told == known.kind
+    check_finite(found.tensors, str(path))
+    yield "values", "all finite", True
+    if told == "depth_anything":
+        yield from _depth_anything(path, found, _max_depth(path, found, variant))
+    elif told == "flash3d":
+        yield from _flash3d(found)
+    elif told == "dinov2":
+        yield from _dinov2(found)
+    else:
+        yield "network", f"{told or 'unknown'}: shapes and output are not checked here", True
+
+
+def drawn_room(height: int = 240, width: int = 320) -> tuple[Picture, Float32Array]:
+    """A picture HxWx3 uint8 of a room 4 x 2.5 x 5 m, tiles and lamp light, 60 degrees wide, and its depth HxW, m."""
+    v, u = np.mgrid[0:height, 0:width]
+    ray = np.stack([u - (width - 1) / 2, v - (height - 1) / 2, np.full(u.shape, 0.866 * width)], -1)
+    ray /= ray[..., 2:]
+    sides = np.array([[-2.0, -1.1, 0.1], [2.0, 1.4, 5.0]])
+    with np.errstate(divide="ignore"):
+        reach = np.where(ray > 0, sides[1], sides[0]) / np.where(ray == 0, 1e-9, ray)
+    reach[..., 2] = sides[1, 2]
+    wall, depth = reach.argmin(-1), reach.min(-1)
+    point = ray * depth[..., None]
+    tiles = (np.floor(point / 0.5).astype(int).sum(-1) % 2) * 0.25 + 0.75
+    colours = np.array([[200, 190, 170], [150, 120, 90], [180, 200, 210]])[wall]
+    light = 1 / (1 + 0.08 * ((point - (0, -1, 2.5)) ** 2).sum(-1))
+    grain = np.random.default_rng(0).normal(0, 4, (height, width, 3))
+    rgb = colours * (tiles * light)[..., None] + grain
+    return np.clip(rgb, 0, 255).astype(np.uint8), depth.astype(np.float32)
+
+
+def _max_depth(path: Path, found: Tensors, variant: str) -> float:
+    known, told = of_file(path.name), found.metadata.get("max_depth_m")
+    if known is not None and known.max_depth_m and variant in ("", known.variant):
+        return known.max_depth_m
+    if told in ("20", "80") and variant in ("", found.metadata.get("variant")):
+        return float(told)
+    if known is not None or told or variant not in MAX_DEPTH_M:
+        of = known.variant if known else found.metadata.get("variant", "indoor or outdoor")
+        raise WeightsError(f"--variant is {variant or 'missing'}: expected {of} for {path.name}")
+    return MAX_DEPTH_M[variant]
+
+
+def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Finding]:
+    from garps_core.models.depth_anything import built_from, depth_of
+
+    model = built_from(found.tensors, max_depth)
+    yield "shapes", f"Depth Anything V2 of width {model.pretrained.cls_token.shape[-1]}", True
+    picture, true = drawn_room()
+    (depth,) = depth_of(model, [picture])
+    low, median, high = (float(x) for x in np.percentile(depth, (5, 50, 95)))
+    words = f"{low:.2f} .. {median:.2f} .. {high:.2f} m (5, 50, 95 %)"
+    yield "depth", words, low >= LOW_M and high <= SATURATED * max_depth
+    logs = np.log(np.maximum(depth.ravel(), 1e-6)), np.log(true.ravel())
+    likeness = float(np.corrcoef(*logs)[0, 1]) if logs[0].std() > 0 else 0.0
+    words = f"correlation {likeness:.2f} with the drawn room, {np.median(true):.2f} m deep in the median"
+    yield "likeness", words, likeness > 0
+    if likeness < -0.3 or median > SATURATED * max_depth:
+        yield (
+            "relative?",
+            "near and far exchanged, or all as far as can be: probably the file of a relative model",
+            False,
+        )
+
+
+def _flash3d(found: Tensors) -> Iterator[Finding]:
+    from garps_core.models.flash3d import HEIGHT, PAD, WIDTH, flash3d_network, flash3d_tensors
+
+    kept, left = flash3d_tensors(found.tensors)
+    network = flash3d_network(kept)
+    others = ", ".join(f"{count} of {group}" for group, count in sorted(left.items())) or "none"
+    yield "shapes", f"Flash3D; not read: {others}", True
+    picture, depth = drawn_room(HEIGHT, WIDTH)
+    border = ((PAD, PAD), (PAD, PAD))
+    rgb = np.pad(picture, (*border, (0, 0))).transpose(2, 0, 1)[None] / np.float32(255)
+    with torch.inference_mode():
+        maps = network(torch.from_numpy(rgb), torch.from_numpy(np.pad(depth, border, "edge")[None, None]))
+    opaque = maps.opacity[0].numpy()
+    yield "opacity", f"{opaque.mean():.2f} +- {opaque.std():.2f}", bool(0.01 < opaque.mean() < 0.999)
+    sigma = float(maps.sigmas.median())
+    yield "sigmas", f"{1000 * sigma:.1f} mm, median", 1e-4 < sigma < 1
+    offset = float(maps.offset.norm(dim=1).median())
+    yield "offsets", f"{1000 * offset:.1f} mm, median", offset < 1
+
+
+def _dinov2(found: Tensors) -> Iterator[Finding]:
+    from garps_core.models import vit
+
+    tensors: Mapping[str, torch.Tensor] = found.tensors
+    if not any(key.startswith("blocks.") for key in tensors):
+        bare = {key.removeprefix("dinov2."): tensor for key, tensor in tensors.items()}
+        tensors = vit.from_transformers({key: tensor for key, tensor in bare.items() if "classifier" not in key})
+    size = vit.size_of(tensors)
+    with torch.device("meta"):
+        network = vit.VisionTransformer(vit.SIZES[size])
+    load_strictly(network, tensors, f"DINOv2 {size}")
+    yield "shapes", f"DINOv2 {size}", True
