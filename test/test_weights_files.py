@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights files: hostile and damaged ones are refused by name and without effect, sound ones are loaded strictly."""
+
+import argparse
+import json
+import os
+import pickle
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from golden_rule import keys, state
+from safetensors.torch import save_file
+from torch import nn
+
+from garps_core.errors import WeightsError
+from garps_core.models import files, manifest, store
+from garps_core.models.files import read_tensors
+from garps_core.models.loading import kind_of, load_strictly, recognised
+
+TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.ones(2), "n": torch.tensor(3)}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty weights folder, with a place beside it."""
+    place = tmp_path / "weights"
+    place.mkdir()
+    monkeypatch.setenv("GARPS_WEIGHTS", str(place))
+    return place
+
+
+class Marks:
+    """Pickled, it makes a file when it is loaded carelessly."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, (f"touch {self.marker}",)
+
+
+class Evaluates(Marks):
+    def __reduce__(self) -> tuple[object, ...]:
+        return eval, (f"open({str(self.marker)!r}, 'w')",)
+
+
+def cut(path: Path, share: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def safetensors_of(path: Path, header: dict[str, object], data: bytes = b"") -> None:
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data)
+
+
+def rezipped(path: Path, method: int, more: dict[str, bytes]) -> None:
+    """The same torch file, written anew by `zipfile` with entries added."""
+    with zipfile.ZipFile(path) as old:
+        entries = {name: old.read(name) for name in old.namelist()}
+    with zipfile.ZipFile(path, "w", method) as new:
+        for name, content in (entries | more).items():
+            new.writestr(name, content)
+
+
+def pickled_command(path: Path, marker: Path) -> None:
+    torch.save({"a": torch.ones(2), "b": Marks(marker)}, path)
+
+
+def pickled_eval(path: Path, marker: Path) -> None:
+    torch.save({"args": argparse.Namespace(model=Evaluates(marker)), "model": TENSORS}, path)
+
+
+def bare_pickle(path: Path, marker: Path) -> None:
+    path.write_bytes(pickle.dumps(Marks(marker)))
+
+
+def legacy_torch(path: Path, marker: Path) -> None:
+    torch.save({"b": Marks(marker)}, path, _use_new_zipfile_serialization=False)
+
+
+def namespace(path: Path, marker: Path) -> None:
+    torch.save({"args": argparse.Namespace(model=f"eval(open({str(marker)!r}, 'w'))"), "model": TENSORS}, path)
+
+
+def whole_network(path: Path, marker: Path) -> None:
+    torch.save(nn.Linear(2, 2), path)
+
+
+def script(path: Path, marker: Path) -> None:
+    torch.jit.save(torch.jit.script(nn.Linear(2, 2)), path)
+
+
+def truncated_zip(path: Path, marker: Path) -> None:
+    torch.save({"a": torch.ones(1000)}, path)
+    cut(path, 0.6)
+
+
+def truncated_safetensors(path: Path, marker: Path) -> None:
+    save_file({"a": torch.ones(1000)}, path)
+    cut(path, 0.6)
+
+
+def truncated_header(path: Path, marker: Path) -> None:
+    save_file(TENSORS, path)
+    cut(path, 0.2)
+
+
+def huge_header(path: Path, marker: Path) -> None:
+    with path.open("wb") as stream:  # sparse: takes no room on the disk
+        stream.write(struct.pack("<Q", 2**25 + 1) + b"{")
+        stream.truncate(2**26)
+
+
+def overlapping(path: Path, marker: Path) -> None:
+    entry = {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]}
+    safetensors_of(path, {"a": entry, "b": entry}, bytes(16))
+
+
+def deep_header(path: Path, marker: Path) -> None:
+    text = b'{"a":' * 200_000
+    path.write_bytes(struct.pack("<Q", len(text)) + text)
+
+
+def zip_bomb(path: Path, marker: Path) -> None:
+    torch.save(TENSORS, path)
+    rezipped(path, zipfile.ZIP_DEFLATED, {"archive/data/9": bytes(200_000_000)})
+
+
+def many_entries(path: Path, marker: Path) -> None:
+    torch.save(TENSORS, path)
+    rezipped(path, zipfile.ZIP_STORED, {str(i): b"" for i in range(50)})
+
+
+def expanded(path: Path, marker: Path) -> None:
+    torch.save({"a": torch.ones(1).expand(10**12)}, path)
+
+
+def repeated(path: Path, marker: Path) -> None:
+    one = torch.ones(100_000)
+    torch.save({f"t{i}": one for i in range(50)}, path)
+
+
+def sparse(path: Path, marker: Path) -> None:
+    torch.save({"a": torch.eye(3).to_sparse()}, path)
+
+
+def on_meta(path: Path, marker: Path) -> None:
+    torch.save({"a": torch.ones(3, device="meta")}, path)
+
+
+def list_of_tensors(path: Path, marker: Path) -> None:
+    torch.save([torch.ones(2)], path)
+
+
+def list_among_tensors(path: Path, marker: Path) -> None:
+    torch.save(TENSORS | {"more": [1, 2]}, path)
+
+
+def no_tensors(path: Path, marker: Path) -> None:
+    torch.save({}, path)
+
+
+def link_out(path: Path, marker: Path) -> None:
+    outside = path.parent.parent / "outside.pth"
+    torch.save(TENSORS, outside)
+    path.symlink_to(outside)
+
+
+def link_in_a_circle(path: Path, marker: Path) -> None:
+    path.symlink_to(path)
+
+
+def folder_instead(path: Path, marker: Path) -> None:
+    path.mkdir()
+
+
+def fifo(path: Path, marker: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path, marker: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+HOSTILE: dict[Callable[[Path, Path], None], str] = {
+    pickled_command: "class posix.system: expected tensors only",
+    pickled_eval: "expected tensors only",
+    bare_pickle: "bare pickle",
+    legacy_torch: "bare pickle",
+    namespace: "class argparse.Namespace",
+    whole_network: "class torch.nn.modules.linear.Linear",
+    script: "TorchScript",
+    truncated_zip: "no sound torch file",
+    truncated_safetensors: "no sound safetensors file",
+    truncated_header: "header of",
+    huge_header: "header of 33554433 bytes",
+    overlapping: "no sound safetensors file",
+    deep_header: "no sound safetensors file",
+    zip_bomb: "none compressed",
+    many_entries: "expected at most 40",
+    expanded: "more values than data",
+    repeated: "claims more data than it has",
+    sparse: "expected a plain tensor",
+    on_meta: "expected a plain tensor",
+    list_of_tensors: "class list: expected tensors by name",
+    list_among_tensors: "class list under 'more'",
+    no_tensors: "holds nothing",
+    link_out: "leads out of the weights folder",
+    link_in_a_circle: "cannot read",
+    folder_instead: "is a folder",
+    fifo: "is a FIFO",
+    device: "is a device",
+}
+
+
+@pytest.mark.parametrize("make", HOSTILE, ids=lambda make: make.__name__)
+def test_a_hostile_file_is_refused_without_effect(
+    make: Callable[[Path, Path], None], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "MAX_ENTRIES", 40)
+    path, marker = folder / "model.pth", tmp_path / "marker"
+    make(path, marker)
+    with pytest.raises(WeightsError) as caught:
+        read_tensors(path)
+    assert HOSTILE[make] in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "expected" in str(caught.value) or "not to be trusted" in str(caught.value) or "damaged" in str(caught.value)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("make", [pickled_command, bare_pickle, legacy_torch])
+def test_these_files_would_have_done_harm(make: Callable[[Path, Path], None], tmp_path: Path) -> None:
+    """The marker really appears when such a file is opened without protection, or else nothing was tested."""
+    make(tmp_path / "a.pth", tmp_path / "marker")
+    if make is bare_pickle:
+        pickle.loads((tmp_path / "a.pth").read_bytes())
+    else:
+        torch.load(tmp_path / "a.pth", weights_only=False)
+    assert (tmp_path / "marker").exists()
+
+
+def test_size_hash_and_record_are_checked(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    save_file(TENSORS, path)
+    size, digest = path.stat().st_size, files.hash_of(path)
+    assert read_tensors(path, max_bytes=size, sha256=digest).sha256 == digest
+    with pytest.raises(WeightsError, match=f"has {size} bytes: expected at most {size - 1}"):
+        read_tensors(path, max_bytes=size - 1)
+    with pytest.raises(WeightsError, match="sha256"):
+        read_tensors(path, sha256="0" * 64)
+    store.record(folder, path.name, store.Record("1" * 64, size, "a test"))
+    with pytest.raises(WeightsError, match=r"expected 1111.*checksums\.json"):
+        read_tensors(path)
+    store.record(folder, path.name, store.Record(digest, size, "a test"))
+    assert read_tensors(path).sha256 == digest
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"a": 1}', '{"a": {"sha256": "xyz", "bytes": 1, "source": ""}}'])
+def test_damaged_records_are_named(folder: Path, text: str) -> None:
+    save_file(TENSORS, folder / "a.safetensors")
+    (folder / store.CHECKSUMS).write_text(text)
+    with pytest.raises(WeightsError, match=r"checksums\.json"):
+        read_tensors(folder / "a.safetensors")
+
+
+WRAPPED = {
+    "plain": lambda t: t,
+    "Flash3D": lambda t: {"model": t, "version": "2", "optimiser": {"state": {0: torch.ones(2)}}, "step": 3},
+    "mmcv": lambda t: {"meta": {"epoch": 1, "config": "x = 1"}, "state_dict": t},
+    "known words beside": lambda t: t | {"epoch": 3, "_metadata": {}},
+}
+
+
+@pytest.mark.parametrize("way", WRAPPED)
+def test_torch_files_are_read_however_wrapped(tmp_path: Path, way: str) -> None:
+    path = tmp_path / "any.name"
+    torch.save(WRAPPED[way](TENSORS), path)
+    found = read_tensors(path)
+    assert list(found.tensors) == list(TENSORS)
+    assert all(torch.equal(found.tensors[key], TENSORS[key]) for key in TENSORS)
+    assert (way == "Flash3D") == (found.metadata == {"version": "2", "step": "3", "wrapper": "model"})
+
+
+def test_a_namespace_is_read_where_it_is_known_to_be(tmp_path: Path) -> None:
+    namespace(tmp_path / "mast3r.pth", tmp_path / "marker")
+    assert set(read_tensors(tmp_path / "mast3r.pth", kind="mast3r").tensors) == set(TENSORS)
+    assert not (tmp_path / "marker").exists()
+    pickled_eval(tmp_path / "worse.pth", tmp_path / "marker")
+    with pytest.raises(WeightsError, match="expected tensors only"):
+        read_tensors(tmp_path / "worse.pth", kind="mast3r")
+    namespace(tmp_path / "later.pth", tmp_path / "marker")
+    with pytest.raises(WeightsError, match="Namespace"):  # the permission has ended
+        read_tensors(tmp_path / "later.pth")
+
+
+def test_safetensors_keep_their_metadata_and_links_inside_are_fine(folder: Path) -> None:
+    save_file(TENSORS, folder / "a.safetensors", {"max_depth_m": "20"})
+    (folder / "b").symlink_to("a.safetensors")
+    assert read_tensors(folder / "b").metadata == {"max_depth_m": "20"}
+
+
+def test_an_old_torch_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.save(TENSORS, tmp_path / "a.pth")
+    monkeypatch.setattr(torch, "__version__", "2.5.1+cu121")
+    with pytest.raises(WeightsError, match=r"2\.6"):
+        read_tensors(tmp_path / "a.pth")
+
+
+def network() -> nn.Module:
+    with torch.device("meta"):
+        return nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
+
+
+def whole() -> dict[str, torch.Tensor]:
+    made = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2)).state_dict()
+    return {key: value for key, value in made.items() if not key.endswith("num_batches_tracked")}
+
+
+def test_loading_copies_converts_and_fills_what_may_be_absent() -> None:
+    given = whole()
+    given["0.weight"] = given["0.weight"].half()
+    module = network()
+    load_strictly(module, given, "a test")
+    assert module[0].weight.dtype == torch.float32
+    assert module[0].weight.data_ptr() != given["0.weight"].data_ptr()
+    given["0.bias"] += 1
+    assert not torch.equal(module[0].bias, given["0.bias"])
+    assert int(module[1].num_batches_tracked) == 0
+    assert module.eval()(torch.ones(1, 3)).isfinite().all()
+    load_strictly(module, whole(), "a test", dtype=torch.float16)
+    assert module[0].weight.dtype == torch.float16
+
+
+FAULTS = {
+    "missing": (lambda t: t.pop("0.bias"), "1 of 7 tensors are missing, the first 0.bias"),
+    "unexpected": (lambda t: t.update(x=torch.ones(1)), "1 are unexpected, the first x"),
+    "misshaped": (lambda t: t.update({"0.bias": torch.ones(5)}), "0.bias: 5 float32, expected 2 float32"),
+    "integers": (lambda t: t.update({"0.bias": torch.ones(2, dtype=torch.int64)}), "0.bias: 2 int64"),
+    "not a number": (lambda t: t["0.weight"].fill_(float("nan")), "0.weight has 6 of 6 values that are not finite"),
+    "too large": (lambda t: t.update({"0.bias": torch.full((2,), 1e200, dtype=torch.float64)}), "not finite"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_loading_names_the_fault(fault: str) -> None:
+    given = whole()
+    change, expected = FAULTS[fault]
+    change(given)
+    with pytest.raises(WeightsError) as caught:
+        load_strictly(network(), given, "a test")
+    assert expected in str(caught.value)
+    assert "a test" in str(caught.value)
+
+
+RECOGNISED = {
+    ("dav2_vits_metric", "model"): ("depth_anything", "Depth Anything, official names"),
+    ("flash3d", "model"): ("flash3d", "Flash3D"),
+    ("dinov2_vits14_ade20k", "backbone"): ("dinov2", "a DINOv2 backbone, official names"),
+    ("dinov2_vits14_ade20k", "linear"): ("ade20k_linear", "an ADE20K head"),
+    ("dinov2_vits14_ade20k", "ms"): ("", "an ADE20K head"),  # as wide as the linear head of the giant
+}
+
+
+@pytest.mark.parametrize("file", RECOGNISED, ids="-".join)
+def test_other_networks_are_recognised(file: tuple[str, str]) -> None:
+    found = {key: torch.from_numpy(value) for key, value in state(*file).items()}
+    kind, words = RECOGNISED[file]
+    assert kind_of(found) == kind
+    with pytest.raises(WeightsError, match=f"5 of 7 tensors are missing, .*the file is {words}$"):
+        load_strictly(network(), found, "a test", optional="num_batches_tracked$|0.bias")
+
+
+def test_more_networks_are_recognised() -> None:
+    listed = keys("dav2_vits_metric_hf")
+    names = [row[0] for row in next(iter(listed["files"].values()))]
+    assert recognised(dict.fromkeys(names)) == "Depth Anything, transformers names"
+    assert kind_of(dict.fromkeys(["dec_blocks.0.cross_attn.projq.weight", "downstream_head1.dpt.x"])) == "dust3r"
+    assert recognised({"x": 1}) == "a network that is not known here"
+    assert kind_of({}) == ""
+
+
+def test_the_table_is_consistent(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len({weights.local for weights in manifest.ALL}) == len(manifest.BY_NAME) == len(manifest.ALL)
+    for weights in manifest.ALL:
+        assert weights.repo or weights.url
+        assert weights.needs_acceptance == (weights.licence != "Apache-2.0")
+        assert (weights.kind == "depth_anything") == (weights.max_depth_m is not None)
+    with pytest.raises(WeightsError, match="garps weights fetch depth-anything-v2-outdoor-small"):
+        store.default("depth_anything", "outdoor")
+    (folder / "depth_anything_v2_metric_vkitti_vitb.pth").touch()
+    assert store.default("depth_anything").name == "depth-anything-v2-outdoor-base"
+    monkeypatch.delenv("GARPS_WEIGHTS")
+    monkeypatch.setenv("XDG_DATA_HOME", "/data")
+    assert store.weights_folder() == Path("/data/garps/weights")
+    monkeypatch.setenv("XDG_DATA_HOME", "relative")
+    assert store.weights_folder() == Path.home() / ".local/share/garps/weights"
