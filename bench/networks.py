@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the networks cost on this machine's CPU, and how close they come to its own matrix multiplication.
+
+    python -m bench.networks [--only depth-anything] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
+
+Each network runs as GARPS calls it, from images, with random weights (the cost does not depend on them), float32, in a
+fresh process. Every timed call stands between multiplications of large matrices, so that whatever else the machine does
+hits both; numbers are medians. The share by CPU time also bears a machine whose cores are taken by others.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
+
+from bench.speed_parts import Check, Row, Section, markdown, print_section
+from bench.tables import machine_facts
+
+Call = Callable[[], Any]
+BAR_SHARE = 0.5
+"""Of the multiplication's throughput: the least that the default depth network must reach on two images."""
+MATRIX = 2048
+"""Rows and columns of the multiplied matrices."""
+MULTIPLICATIONS = 4
+"""Before each timed call, and after."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One line of the table: a network of one size on so many images of one size."""
+
+    network: str
+    size: str
+    images: int
+    rows: int
+    columns: int
+    bar: float | None = None
+
+    def pictures(self) -> list[Any]:
+        """The images, HxWx3 uint8, of noise."""
+        rng = np.random.default_rng(0)
+        return [rng.integers(0, 256, (self.rows, self.columns, 3), np.uint8) for _ in range(self.images)]
+
+
+def depth_anything(case: Case) -> tuple[Call, str]:
+    """Depth Anything V2, and the size its images get."""
+    from garps_core.models.depth_anything import DepthAnythingV2, built_from, depth_of, network_size
+
+    model = built_from(DepthAnythingV2(case.size, 20.0).state_dict(), max_depth=20.0)
+    pictures = case.pictures()
+    rows, columns = network_size(pictures[0])
+    return lambda: depth_of(model, pictures), f"{rows}x{columns}"
+
+
+MAKERS: Mapping[str, Callable[[Case], tuple[Call, str]]] = {"depth-anything": depth_anything}
+"""By name of the network: what makes its call, and tells the size that its input has. Add a network here."""
+CASES = (
+    *(Case("depth-anything", size, 1, 518, 518) for size in ("vits", "vitb", "vitl")),
+    *(Case("depth-anything", size, 2, 480, 640, bar=BAR_SHARE) for size in ("vits", "vitb", "vitl")),
+)
+"""And its lines here; a network of one size only has size "" and is always among those measured."""
+
+
+def chosen(only: str, sizes: str) -> list[Case]:
+    """The cases of the named networks (all when empty) and sizes. Raises typer.BadParameter on another name."""
+    networks, wanted = ([part.strip() for part in names.split(",") if part.strip()] for names in (only, sizes))
+    for what, names, known in (("network", networks, set(MAKERS)), ("size", wanted, {case.size for case in CASES})):
+        if unknown := set(names) - known:
+            raise typer.BadParameter(f"no {what} {', '.join(sorted(unknown))}: expected some of {', '.join(known)}")
+    return [case for case in CASES if case.network in (networks or MAKERS) and case.size in ("", *wanted)]
+
+
+def measured(case: Case, runs: int, threads: int) -> Row:
+    """One line of the table; for a process of its own, whose peak memory counts."""
+    torch.set_num_threads(threads)
+    imported = _peak_mib()
+    call, inside = MAKERS[case.network](case)
+    flop, peak = counted_flop(call), _peak_mib()
+    rounds = [_round(call, flop) for _ in range(runs + 1)][1:]  # the first warms up
+    told = {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
+    images = f"{case.images} of {case.rows}x{case.columns}"
+    names = {"network": f"{case.network} {case.size}".strip(), "images": images, "inside": inside}
+    return names | told | {"peak MiB": peak, "beyond imports MiB": peak - imported, "GFLOP": flop / 1e9}
+
+
+def counted_flop(call: Call) -> int:
+    """Floating-point operations of matrix products, convolutions and attention in a call; a multiply-add is two."""
+    attention = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flop}
+    with FlopCounterMode(display=False, custom_mapping=attention) as counter:
+        call()
+    return int(counter.get_total_flops())
+
+
+def _attention_flop(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
+    return int(sdpa_flop_count(query, key, value))
+
+
+def _round(call: Call, flop: int) -> dict[str, float]:
+    """A call between multiplications: its cost, its rate, and its share of their rate by wall and by CPU time."""
+    matrices = [torch.ones(MATRIX, MATRIX) for _ in range(3)]
+
+    def multiply() -> None:
+        for _ in range(MULTIPLICATIONS):
+            torch.mm(matrices[0], matrices[1], out=matrices[2])
+
+    before, own, after = (_seconds(action) for action in (multiply, call, multiply))
+    product_flop = 2 * 2 * MULTIPLICATIONS * MATRIX**3
+    wall_rate, cpu_rate = (product_flop / (before[i] + after[i]) for i in (0, 1))
+    return {
+        "wall s": own[0],
+        "CPU s": own[1],
+        "GFLOP/s": flop / own[0] / 1e9,
+        "matrices GFLOP/s": wall_rate / 1e9,
+        "share": flop / own[0] / wall_rate,
+        "share by CPU time": flop / own[1] / cpu_rate,
+    }
+
+
+def _seconds(action: Call) -> tuple[float, float]:
+    """Wall and CPU seconds, the latter of all threads."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    action()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def lines(cases: list[Case], runs: int, threads: int) -> Iterator[Row]:
+    """A line per case, each from a process of its own."""
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        for case in cases:
+            yield pool.apply(measured, (case, runs, threads))
+
+
+def main(
+    only: Annotated[str, typer.Option(help=f"some of {', '.join(MAKERS)}; all when empty")] = "",
+    sizes: Annotated[str, typer.Option(help="some of vits, vitb, vitl, where a network has sizes")] = "vits",
+    runs: Annotated[int, typer.Option(min=1, help="timed calls of each")] = 5,
+    threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    out: Annotated[Path, typer.Option(help="where the results go")] = Path("out/networks"),
+) -> None:
+    """CPU seconds, peak memory and throughput of the networks, and their share of what matrices reach here."""
+    cases, console = chosen(only, sizes), Console()
+    told = machine_facts() | {"torch threads": threads}
+    console.print("; ".join(f"{name} {value}" for name, value in told.items()), markup=False)
+    rows, checks = [], []
+    for case, row in zip(cases, lines(cases, runs, threads), strict=True):
+        what = f"share of matrix multiplication, {row['network']}, {row['images']}"
+        rows.append(row)
+        checks += [Check(what, row["share"], case.bar, at_least=True)] if case.bar is not None else []
+        console.print(f"{row['network']}, {row['images']}: {row['wall s']:.2f} s", markup=False)
+    section = Section(f"Networks, float32, {threads} threads, medians of {runs}", checks, rows)
+    print_section(console, section)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "run.json").write_text(json.dumps({"facts": told, "networks": section.as_json()}, indent=1))
+    (out / "table.md").write_text(markdown({"networks": section}, told))
+
+
+if __name__ == "__main__":
+    typer.run(main)
