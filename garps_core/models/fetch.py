@@ -123,7 +123,7 @@ def _check_size(weights: Weights, offer: _Offer, folder: Path) -> None:
 
 
 def _downloaded(hub: Any, weights: Weights, offer: _Offer, folder: Path) -> Path:
-    staging = folder / f".fetch-{weights.name}"  # stays after a failure: some versions of the library resume from it
+    staging = folder / f".fetch-{weights.name}"
     try:
         return Path(
             hub.hf_hub_download(
@@ -131,6 +131,8 @@ def _downloaded(hub: Any, weights: Weights, offer: _Offer, folder: Path) -> Path
             )
         )
     except Exception as error:
+        if not any(staging.rglob("*.incomplete")):  # some versions of the library go on from that the next time
+            shutil.rmtree(staging, ignore_errors=True)
         raise _failed(weights, error) from None
 
 
