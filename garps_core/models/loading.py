@@ -19,7 +19,7 @@ _TELLING = (
     ("dust3r", "DUSt3R with a DPT head", (r"^dec_blocks\.0\.cross_attn\.", r"^downstream_head1\.dpt\.")),
     ("dust3r", "DUSt3R with a linear head", (r"^dec_blocks\.0\.cross_attn\.", r"^downstream_head1\.proj\.")),
     ("croco", "CroCo, which MASt3R and DUSt3R began from", (r"^dec_blocks\.0\.cross_attn\.",)),
-    ("flash3d", "Flash3D", (r"encoder\.encoder\.conv1\.weight$", r"models\.gauss_decoder_0\.")),
+    ("flash3d", "Flash3D", (r"(^|\.)models\.gauss_decoder_[01]\.",)),
     ("sharp", "Apple SHARP", (r"^monodepth_model\.",)),
     ("m2f", "DINOv2 with a Mask2Former head", (r"^decode_head\.pixel_decoder\.", r"^backbone\.interactions\.")),
     ("depth_anything", "Depth Anything, official names", (r"^pretrained\.blocks\.0\.", r"^depth_head\.")),
