@@ -88,8 +88,10 @@ def measured(case: Case, runs: int, threads: int) -> Row:
     torch.set_num_threads(threads)
     imported = _peak_mib()
     call, inside = MAKERS[case.network](case)
-    flop, peak = counted_flop(call), _peak_mib()
-    rounds = [_round(call, flop) for _ in range(runs + 1)][1:]  # the first warms up
+    call()  # warms up
+    peak = _peak_mib()  # counting keeps intermediate results and would add to it
+    flop = counted_flop(call)
+    rounds = [_round(call, flop) for _ in range(runs)]
     told = {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
     images = f"{case.images} of {case.rows}x{case.columns}"
     names = {"network": f"{case.network} {case.size}".strip(), "images": images, "inside": inside}

@@ -22,7 +22,9 @@ from garps_core.checks import Float32Array
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import vit
 from garps_core.models.dpt import DptHead, Grid, enlarged
+from garps_core.models.loading import load_strictly
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
+from garps_core.pairing import checked_device
 
 RGBImage = npt.NDArray[np.uint8]
 
@@ -74,7 +76,7 @@ def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnything
 
     tensors: of an official file or, under the names of `transformers`, of an `-hf` file. max_depth: metres, 20 for
     indoor and 80 for outdoor weights. Raises ConfigError unless it is positive; WeightsError where tensors are missing,
-    too many or misshaped.
+    too many, misshaped or not finite.
     """
     if not (np.isfinite(max_depth) and max_depth > 0):
         raise ConfigError(
@@ -87,11 +89,8 @@ def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnything
         raise WeightsError(f"Depth Anything V2 of size {size}: expected one of {', '.join(HEADS)}")
     with torch.device("meta"):  # nothing is allocated or initialised twice
         model = DepthAnythingV2(size, max_depth)
-    try:
-        model.load_state_dict(dict(tensors), strict=True, assign=True)
-    except RuntimeError as error:
-        raise WeightsError(f"weights that do not fit Depth Anything V2 {size}: {error}") from None
-    model.float().eval().requires_grad_(False)
+    load_strictly(model, tensors, f"Depth Anything V2 {size}")
+    model.eval().requires_grad_(False)
     model.depth_head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model
 
@@ -140,12 +139,21 @@ def depth_of(
 ) -> list[Float32Array]:
     """Depth along the optical axis of each image: HxW float32, metres.
 
-    images: HxWx3 uint8 RGB; those of one network size share one pass. depth_scale: factor on every depth. fx: focal
-    lengths in pixels, one per image, for depth * (fx / W) / (that of the training's cameras), not corrected when None.
-    device: the model is moved there; it stays where it is when None. dtype: of the layers that autocast may compute in
-    less than float32; the sigmoid and the resizes never do.
-    Raises InputError for what is no such image, is smaller than a patch or too elongated; ConfigError for a scale or
-    dtype that cannot be; ModelError when memory does not suffice for one image or the depth is not finite.
+    Images whose network sizes agree share one pass.
+
+    Args:
+        model: on any device.
+        images: HxWx3 uint8 RGB.
+        depth_scale: factor on every depth.
+        fx: focal lengths in pixels, one per image, for depth * (fx / W) / (that of the training's cameras); depth is
+            not corrected when None.
+        device: the model is moved there; it stays where it is when None.
+        dtype: of the layers that autocast may compute in less than float32, for a GPU (a CPU is often slower in it);
+            the sigmoid and the resize to the image never do.
+    Raises:
+        InputError: no such image, one smaller than a patch or too elongated; focal lengths that cannot be.
+        ConfigError: a scale, device or dtype that cannot be.
+        ModelError: too little memory for one image, or depth that is not finite.
     """
     if not (np.isfinite(depth_scale) and depth_scale > 0):
         raise ConfigError(f"depth_scale = {depth_scale:g}: expected a factor above 0, 1 to leave depth as it is")
@@ -154,7 +162,7 @@ def depth_of(
     sizes = [network_size(checked_image(image)) for image in images]
     scales = np.float32(depth_scale) * _focal_factors(images, fx)
     if device is not None:
-        model.to(device)
+        model.to(checked_device(str(device)))
     found: dict[int, Float32Array] = {}
     for size in dict.fromkeys(sizes):
         members = [i for i, own in enumerate(sizes) if own == size]
