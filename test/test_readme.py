@@ -17,6 +17,7 @@ from garps_ros import replay
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+WEIGHTS_COMMANDS = ("list", "fetch", "verify", "convert", "check")
 K = np.array([[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
 
 
@@ -114,11 +115,18 @@ def test_named_commands_exist(path: Path) -> None:
 @pytest.mark.parametrize("path", PAGES, ids=name)
 def test_named_options_exist(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     helps = {}
-    for program, main, words in (("garps", cli.main, ["align", "--help"]), ("garps-replay", replay.main, ["--help"])):
+    for program, main, words in (
+        ("garps", cli.main, ["align", "--help"]),
+        *((f"garps weights {name}", cli.main, ["weights", name, "--help"]) for name in WEIGHTS_COMMANDS),
+        ("garps-replay", replay.main, ["--help"]),
+    ):
         main(words)
         helps[program] = capsys.readouterr().out + "--help --version"
     for words in commands(path):
         program = Path(words[0]).name
+        if words[1:2] == ["weights"]:
+            assert words[2] in WEIGHTS_COMMANDS
+            program = " ".join(("garps", *words[1:3]))
         for option in [word.split("=")[0] for word in words if word.startswith("--")]:
             assert program not in helps or option in helps[program], f"{program} {option}"
 
