@@ -229,8 +229,9 @@ def test_scale_and_focal_length_multiply_depth(model, small_side):
     (corrected,) = depth_of(model, rgb, fx=[80 * 0.5])
     np.testing.assert_allclose(scaled, 1.25 * plain, rtol=1e-6)
     np.testing.assert_allclose(corrected, np.tan(np.radians(30)) * plain, rtol=1e-6)
-    (same,) = depth_of(model, rgb, fx=[40 / np.tan(np.radians(30))])
-    np.testing.assert_allclose(same, plain, rtol=1e-6)
+    same, half = depth_of(model, rgb * 2, fx=[40 / np.tan(np.radians(30)), 20 / np.tan(np.radians(30))])
+    np.testing.assert_allclose(same, plain, atol=2e-3)
+    np.testing.assert_allclose(half, 0.5 * plain, atol=2e-3)
 
 
 @pytest.mark.parametrize(
