@@ -156,8 +156,7 @@ def segment(
         for ratio in ratios
         for mirrored in ((False, True) if flip else (False,))
     ]
-    bands = [_best(passes, first, min(first + BAND_ROWS, height)) for first in range(0, height, BAND_ROWS)]
-    return torch.cat(bands).to(torch.int16).cpu().numpy()
+    return best_classes(passes)
 
 
 def scores_of(
@@ -202,21 +201,27 @@ def prepared(picture: RGBImage) -> Tensor:
 def _spreading(patches: int, side: int, wanted: int, official: bool) -> Float64Array:
     """(wanted, patches): scores of an axis on patches -> on the network's `side` pixels -> on the `wanted` ones."""
     if official:
-        inner = _stretching(patches, side)
+        inner = stretching(patches, side)
     else:
         first = (patches * PATCH - side) // 2
-        inner = _stretching(patches, patches * PATCH)[first : first + side]
-    return _stretching(side, wanted) @ inner
+        inner = stretching(patches, patches * PATCH)[first : first + side]
+    return stretching(side, wanted) @ inner
 
 
-def _stretching(cells: int, wanted: int) -> Float64Array:
+def stretching(cells: int, wanted: int) -> Float64Array:
     """(wanted, cells): bilinear resizing along an axis, corners on corners of cells."""
     unit = torch.eye(cells, dtype=torch.float64)[None]
     return np.asarray(F.interpolate(unit, size=wanted, mode="linear", align_corners=False)[0].T.numpy())
 
 
+def best_classes(passes: Sequence[Scores]) -> Labels:
+    """HxW: the class of the highest score, or of the highest mean probability of several passes."""
+    height = len(passes[0].rows)
+    bands = [_best(passes, first, min(first + BAND_ROWS, height)) for first in range(0, height, BAND_ROWS)]
+    return torch.cat(bands).to(torch.int16).cpu().numpy()
+
+
 def _best(passes: Sequence[Scores], first: int, last: int) -> Tensor:
-    """Class of the pixels of some rows: of the highest score, or of the highest mean probability of several passes."""
     if len(passes) == 1:
         return passes[0].pixels(first, last).argmax(dim=0)
     return sum((one.pixels(first, last).softmax(dim=0) for one in passes), start=torch.zeros(())).argmax(dim=0)
