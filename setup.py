@@ -15,7 +15,7 @@ def present(pattern: str) -> list[str]:
 
 
 FIGURE = ["matplotlib>=3.6"]
-WEIGHTS = ["huggingface_hub>=0.30"]  # `garps weights fetch` alone needs it; a robot may never go on line
+WEIGHTS = ["huggingface_hub>=1.20"]  # for `garps weights fetch` alone; before, a broken connection was the end of it
 TEST = ["pytest", "pytest-cov", "hypothesis", "plyfile"]
 BENCH = ["trimesh", "embreex", "open3d-cpu", "small-gicp"]
 

@@ -99,10 +99,15 @@ def test_a_file_under_the_name_of_another_is_found_out(folder: Path, depth: Tens
 
 
 @pytest.mark.parametrize("head", ["linear", "ms"])
-def test_heads_are_verified_though_their_width_may_be_ambiguous(folder: Path, head: str) -> None:
+def test_heads_are_verified_though_their_width_may_be_ambiguous(folder: Path, head: str, capsys: Printed) -> None:
     found = tensors_of("dinov2_vits14_ade20k", head)
     torch.save({"meta": {}, "state_dict": found}, folder / f"dinov2_vits14_ade20k_{head}_head.pth")
     assert weights("verify", f"dinov2-small-ade20k-{head}") == 0
+    assert weights("check", folder / f"dinov2_vits14_ade20k_{head}_head.pth") == 0
+    assert "150 classes" in capsys.readouterr().out
+    del found["decode_head.bn.bias"]
+    torch.save(found, folder / "other.pth")
+    assert "the first bn.bias" in refused(capsys, "check", folder / "other.pth")
 
 
 def test_converting_flash3d_keeps_what_is_needed(

@@ -123,11 +123,14 @@ def regular_file(path: Path, folder: Path) -> Path:
 
 
 def hash_of(path: Path) -> str:
-    """SHA-256 of a regular file, 64 hexadecimal digits."""
+    """SHA-256 of a regular file, 64 hexadecimal digits. WeightsError if it cannot be read."""
     digest = hashlib.sha256()
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
-        while chunk := stream.read(_CHUNK):
-            digest.update(chunk)
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
+            while chunk := stream.read(_CHUNK):
+                digest.update(chunk)
+    except OSError as error:
+        raise WeightsError(f"cannot read {path} ({error.strerror}): expected a file that this user may read") from None
     return digest.hexdigest()
 
 

@@ -54,6 +54,8 @@ def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Ite
         yield from _flash3d(found)
     elif told == "dinov2":
         yield from _dinov2(found)
+    elif "decode_head.conv_seg.weight" in found.tensors:
+        yield from _head(found)
     else:
         yield "network", f"{told or 'unknown'}: shapes and output are not checked here", told != ""
 
@@ -143,3 +145,17 @@ def _dinov2(found: Tensors) -> Iterator[Finding]:
         network = vit.VisionTransformer(vit.SIZES[size])
     load_strictly(network, tensors, f"DINOv2 {size}")
     yield "shapes", f"DINOv2 {size}", True
+
+
+def _head(found: Tensors) -> Iterator[Finding]:
+    from garps_core.models.semantics import DecodeHead
+
+    weight = found.tensors["decode_head.conv_seg.weight"]
+    if weight.dim() != 4:
+        raise WeightsError(f"decode_head.conv_seg.weight has {weight.dim()} dimensions: expected 4; damaged or another")
+    classes, channels = weight.shape[:2]
+    with torch.device("meta"):
+        head = DecodeHead(channels, classes)
+    inside = {key.removeprefix("decode_head."): tensor for key, tensor in found.tensors.items()}
+    load_strictly(head, inside, "an ADE20K head")
+    yield "shapes", f"a head on {channels} channels, {classes} classes (ADE20K has 150)", classes == 150

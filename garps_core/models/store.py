@@ -73,10 +73,16 @@ def recorded(path: Path, folder: Path) -> Record | None:
 
 
 def record(folder: Path, file: str, entry: Record) -> None:
-    """Add or replace the record of one file, leaving the others."""
+    """Add or replace the record of one file, leaving the others. WeightsError if the folder cannot be written."""
     entries = {**_records(folder), file: entry}
     text = json.dumps({name: asdict(entries[name]) for name in sorted(entries)}, indent=1)
-    handle, temporary = tempfile.mkstemp(dir=folder, prefix=".checksums-")
+    try:
+        handle, temporary = tempfile.mkstemp(dir=folder, prefix=".checksums-")
+    except OSError as error:
+        raise WeightsError(
+            f"cannot write {folder / CHECKSUMS} ({error.strerror}): expected a folder that this user may write; "
+            "verify as the user it belongs to"
+        ) from None
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
             stream.write(text + "\n")
