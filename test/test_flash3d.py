@@ -11,7 +11,7 @@ import torch
 
 from garps_core import Mixture
 from garps_core.config import Lifting
-from garps_core.errors import InputError, ReconstructionError, WeightsError
+from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.models.flash3d import Flash3D, GaussianMaps, flash3d_network, flash3d_tensors
 from garps_core.models.flash3d_mixture import (
     Flash3DGaussians,
@@ -202,6 +202,24 @@ def test_a_view_without_depth_is_refused(network: Flash3D) -> None:
         predict_gaussians(network, bare)
     with pytest.raises(ReconstructionError, match="no reading"):
         predict_gaussians(network, replace(bare, depth=np.full((256, 384), np.nan, np.float32)))
+
+
+def test_half_precision_stays_in_the_layers(network: Flash3D, run: tuple[Arrays, Flash3DGaussians]) -> None:
+    """The first layer stands on the given depth to the last bit, and the second behind it."""
+    found = predict_gaussians(network, golden_view(), dtype=torch.bfloat16)
+    np.testing.assert_array_equal(found.depth[0], np.pad(golden_rule.depth(256, 384), 32, mode="edge"))
+    assert found.means.dtype == np.float32 and (found.depth[1] > found.depth[0]).all()
+    error = np.linalg.norm(found.means - run[1].means, axis=1)
+    assert 1e-5 < np.median(error) < 0.03
+    with pytest.raises(ConfigError, match="int8"):
+        predict_gaussians(network, golden_view(), dtype=torch.int8)
+
+
+def test_gaussians_that_are_no_numbers_are_refused(state: dict[str, torch.Tensor]) -> None:
+    key = f"{PREFIX}models.gauss_decoder_0.out.weight"
+    broken = flash3d_network(flash3d_tensors({**state, key: state[key] * 1e30})[0])
+    with pytest.raises(ModelError, match="NaN or infinity"):
+        predict_gaussians(broken, golden_view())
 
 
 def mixture_of(run: tuple[Arrays, Flash3DGaussians], **settings) -> Mixture:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from garps_core.checks import Float32Array, Float64Array, IntArray
 from garps_core.config import Lifting
-from garps_core.errors import InputError, ReconstructionError
+from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError
+from garps_core.models.depth_anything import DTYPES
 from garps_core.models.flash3d import HEIGHT, LAYERS, PAD, PADDED, WIDTH, Flash3D, GaussianMaps
 from garps_core.models.resampling import lanczos, nearest_index
 from garps_core.reconstruct import MIN_COMPONENTS, _frustum, _in_range, _z_order
@@ -107,7 +108,9 @@ def padded_intrinsics(view: View) -> Float64Array:
     return K
 
 
-def predict_gaussians(network: Flash3D, view: View, drop_border: bool = False) -> Flash3DGaussians:
+def predict_gaussians(
+    network: Flash3D, view: View, drop_border: bool = False, dtype: torch.dtype = torch.float32
+) -> Flash3DGaussians:
     """Run the network on a view with metric depth.
 
     Args:
@@ -115,16 +118,28 @@ def predict_gaussians(network: Flash3D, view: View, drop_border: bool = False) -
         view: `depth` may come from a sensor or a network; it is taken as it is.
         drop_border: leave out what stands on the border around the picture: 196 608 instead of 286 720 Gaussians. The
             border is kept by default, as published: its Gaussians say what lies just outside the picture.
+        dtype: of the layers that autocast may compute in less than float32; everything behind them never is.
     Raises:
-        ReconstructionError: no depth.
+        ReconstructionError: no depth. ConfigError: a dtype that cannot be. ModelError: Gaussians that are not finite,
+        too little memory.
     """
+    if dtype not in DTYPES:
+        raise ConfigError(f"dtype {dtype}: expected one of {', '.join(sorted(map(str, DTYPES)))}")
     given = flash3d_input(view)
     device = next(network.parameters()).device
     picture = torch.from_numpy(given.picture).to(device).permute(2, 0, 1)[None].float() / 255
     depth = torch.from_numpy(given.depth).to(device)[None, None]
-    with torch.inference_mode():
-        maps = network(picture, depth)
-        return gaussians_of(maps, given.K, given.known, drop_border)
+    try:
+        with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+            maps = network(picture, depth)
+        gaussians = gaussians_of(maps, given.K, given.known, drop_border)
+    except torch.cuda.OutOfMemoryError as error:
+        raise ModelError(
+            f"out of memory on {device}: Flash3D needs about 1 GB; free some, or use the CPU ({error})"
+        ) from None
+    if not (np.isfinite(gaussians.means).all() and np.isfinite(gaussians.covariances).all()):
+        raise ModelError(f"the network returned NaN or infinity in {dtype}: expected Gaussians; is float32 needed?")
+    return gaussians
 
 
 def gaussians_of(maps: GaussianMaps, K: Float64Array, known: Bool, drop_border: bool = False) -> Flash3DGaussians:
