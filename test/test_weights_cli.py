@@ -10,6 +10,7 @@ from golden_rule import keys, state
 from safetensors.torch import save_file
 
 from garps_core import cli
+from garps_core.errors import WeightsError
 from garps_core.models.convert import needed
 from garps_core.models.files import hash_of, read_tensors
 from garps_core.models.plausible import drawn_room
@@ -157,6 +158,8 @@ def test_aliases_of_mast3r_files_are_taken_away() -> None:
     kept, left = needed("mast3r", values | aliases)
     assert list(kept) == list(values)
     assert left == {f"{head}layer_rn": 4}
+    with pytest.raises(WeightsError, match=r"layer_rn\.0\.weight differs"):
+        needed("mast3r", values | {f"{head}layer_rn.0.weight": torch.zeros(2)})
     kept, left = needed("mast3r", aliases)
     assert {key: float(value[0]) for key, value in kept.items()} == {key: float(v[0]) for key, v in values.items()}
     assert left == {}

@@ -9,6 +9,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -254,6 +255,44 @@ def test_size_hash_and_record_are_checked(folder: Path) -> None:
         read_tensors(path)
     store.record(folder, path.name, store.Record(digest, size, "a test"))
     assert read_tensors(path).sha256 == digest
+
+
+@pytest.mark.parametrize(("bound", "expected"), [("MAX_HEADER", "a directory of over"), ("MAX_PICKLE", "an index of")])
+def test_the_parts_of_a_torch_file_are_bounded(
+    tmp_path: Path, bound: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.save(TENSORS, tmp_path / "a.pth")
+    read_tensors(tmp_path / "a.pth")
+    monkeypatch.setattr(files, bound, 50)
+    with pytest.raises(WeightsError, match=expected):
+        read_tensors(tmp_path / "a.pth")
+
+
+def test_a_large_directory_is_seen_in_both_kinds_of_zip(tmp_path: Path) -> None:
+    """Zip files of 64 bits have a second, larger end; `zipfile` believes that one."""
+    plain = tmp_path / "plain.zip"
+    with zipfile.ZipFile(plain, "w") as archive:
+        archive.writestr("a", b"")
+    size = files._directory_bytes(plain)
+    assert size == 46 + len("a")
+    content, end = plain.read_bytes(), plain.read_bytes().rfind(b"PK\x05\x06")
+    larger = struct.pack("<4sQHHIIQQQQ", b"PK\x06\x06", 44, 45, 45, 0, 0, 1, 1, 2**40, end - size)
+    locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, end, 1)
+    plain.write_bytes(content[:end] + larger + locator + content[end:])
+    assert files._directory_bytes(plain) == 2**40
+
+
+def test_a_file_that_changes_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, parsed = tmp_path / "a.safetensors", files._parsed
+    save_file(TENSORS, path)
+
+    def disturbed(*arguments: Any) -> Any:
+        os.utime(path, ns=(0, 0))
+        return parsed(*arguments)
+
+    monkeypatch.setattr(files, "_parsed", disturbed)
+    with pytest.raises(WeightsError, match="changed while it was read"):
+        read_tensors(path)
 
 
 def test_what_the_system_refuses_is_named(folder: Path) -> None:
