@@ -209,6 +209,79 @@ def test_a_query_looks_where_its_mask_is_and_everywhere_when_that_is_nowhere(net
     assert all(torch.equal(one, expected) for one in blocked)
 
 
+def inputs_of(modules: list[torch.nn.Module], run) -> list[tuple[torch.Tensor, ...]]:
+    """Positional arguments of each call of the modules, in order of the calls."""
+    seen: list[tuple[torch.Tensor, ...]] = []
+    hooks = [module.register_forward_hook(lambda m, given, out: seen.append(given)) for module in modules]
+    run()
+    for hook in hooks:
+        hook.remove()
+    return seen
+
+
+def test_queries_look_at_the_maps_in_turn_from_coarse_to_fine(network: Mask2Former) -> None:
+    head = network.decode_head
+    refined = []
+    hook = head.pixel_decoder.register_forward_hook(lambda m, given, out: refined.extend(out[1]))
+    calls = inputs_of(list(head.transformer_decoder.layers), lambda: network(picture()))
+    hook.remove()
+    assert [one.shape[-1] for one in refined] == [7, 14, 28]
+    for index, (_, own, values, positions, blocked) in enumerate(calls):
+        level = index % 3
+        torch.testing.assert_close(values, as_tokens([refined[level]]) + head.level_embed.weight[level])
+        torch.testing.assert_close(positions, sine_positions((7 * 2**level,) * 2, 32, values))
+        assert torch.equal(own, head.query_embed.weight) and blocked.shape == (4, 9, values.shape[1])
+    assert len(calls) == 4 and torch.equal(calls[0][0][0], head.query_feat.weight)
+
+
+def test_the_pixel_decoder_takes_its_maps_from_coarse_to_fine(network: Mask2Former) -> None:
+    decoder = network.decode_head.pixel_decoder
+    calls = inputs_of([*decoder.input_convs, *decoder.lateral_convs], lambda: network(picture()))
+    assert [given[0].shape[-1] for given in calls] == [7, 14, 28, 56]
+    first, *_ = inputs_of([decoder.encoder], lambda: network(picture()))
+    expected = [
+        sine_positions((n, n), 32, first[0]) + decoder.level_encoding.weight[i] for i, n in enumerate((7, 14, 28))
+    ]
+    torch.testing.assert_close(first[1], torch.cat(expected))
+
+
+def test_positions_are_added_to_queries_and_keys_but_not_to_values(network: Mask2Former) -> None:
+    layer = network.decode_head.transformer_decoder.layers[0]
+    x, own, values, positions = (torch.randn(1, n, 32) for n in (9, 9, 20, 20))
+    cross, alone = inputs_of(list(layer.attentions), lambda: layer(x, own, values, positions, None))
+    assert torch.equal(cross[0], x + own) and torch.equal(cross[1], values + positions)
+    assert torch.equal(cross[2], values)
+    assert torch.equal(alone[0], alone[1]) and torch.equal(alone[0], alone[2] + own)
+
+
+def test_blocks_and_extractors_come_in_their_order(network: Mask2Former) -> None:
+    backbone, order = network.backbone, []
+    names = {name: m for name, m in backbone.named_modules() if name.count(".") == 1 and name.startswith("blocks.")}
+    names |= {
+        n: m for n, m in backbone.named_modules() if n.endswith(("injector", "extractor", "tractors.0", "tractors.1"))
+    }
+    hooks = [m.register_forward_hook(lambda *_, name=name: order.append(name)) for name, m in names.items()]
+    backbone(picture())
+    for hook in hooks:
+        hook.remove()
+    expected = [
+        name for i in range(4) for name in (f"interactions.{i}.injector", f"blocks.{i}", f"interactions.{i}.extractor")
+    ]
+    assert order == [*expected, "interactions.3.extra_extractors.0", "interactions.3.extra_extractors.1"]
+
+
+def test_the_first_of_the_two_gates_goes_through_silu(network: Mask2Former) -> None:
+    mlp, x = network.backbone.blocks[0].mlp, torch.randn(1, 5, 64)
+    gate = mlp.w1(x)
+    torch.testing.assert_close(mlp(x), mlp.w3(gate * gate.sigmoid() * mlp.w2(x)))
+
+
+def test_the_last_class_means_nothing_there(state: dict[str, torch.Tensor]) -> None:
+    bias = "decode_head.cls_embed.bias"
+    empty = mask2former_of({**state, bias: state[bias] + 50 * F.one_hot(torch.tensor(7), 8)})
+    assert empty(picture()).max() < 1e-6
+
+
 def test_labels_of_a_picture_of_any_size(network: Mask2Former) -> None:
     rgb = golden_rule.image(150, 250)
     labels = segment_by_masks(network, rgb)

@@ -137,13 +137,13 @@ CAMERA = (
 
 
 def test_a_camera_in_the_file_becomes_the_frustum(tmp_path: Path) -> None:
-    rows = table(3)
+    rows = table(4)
     # pixel (600.5, 120.5) counted from edges: cell (200, 40) of a grid three times as coarse
     rows["x"], rows["y"], rows["z"] = (600.5 - 480) / 800 * 2, (120.5 - 320) / 800 * 2, 2.0
-    rows["x"][1:] *= (1.5, 0.5)
-    rows["y"][1:] *= (1.5, 0.5)
-    rows["z"][1:] *= (1.5, 0.5)
-    rows["opacity"] = (3, 3, -3)  # the nearest hides nothing
+    rows["x"][1:] *= (1.5, 0.5, -1)
+    rows["y"][1:] *= (1.5, 0.5, -1)
+    rows["z"][1:] *= (1.5, 0.5, -1)
+    rows["opacity"] = (3, 3, -3, 3)  # the nearest hides nothing, the last is behind the camera
     frustum = read_splats(written(tmp_path / "a.ply", rows, *CAMERA)).frustum
     assert frustum is not None and frustum.brightness is None
     assert frustum.depth.shape == (213, 320)
