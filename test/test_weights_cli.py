@@ -13,7 +13,9 @@ from garps_core import cli
 from garps_core.errors import WeightsError
 from garps_core.models.convert import needed
 from garps_core.models.files import hash_of, read_tensors
+from garps_core.models.mask2former import HeadSize, Mask2Former
 from garps_core.models.plausible import drawn_room
+from garps_core.models.vit_adapter import AdapterSize
 
 DEPTH = "depth_anything_v2_metric_hypersim_vits.pth"
 Printed = pytest.CaptureFixture[str]
@@ -233,3 +235,10 @@ def test_a_file_of_anything_else_is_named(tmp_path: Path, capsys: Printed) -> No
     assert "cannot read" in refused(capsys, "check", tmp_path / "none.pth")
     assert cli.main(["weights"]) == 2
     assert "convert" in capsys.readouterr().out
+
+
+def test_check_reads_a_small_mask2former(tmp_path: Path, capsys: Printed) -> None:
+    network = Mask2Former(AdapterSize(64, 4, 48, 4, 4, 32, 16), HeadSize(32, 32, 4, 2, 4, 40, 56, 9, 150))
+    torch.save({"meta": {"epoch": 1}, "state_dict": network.state_dict(), "optimizer": {}}, tmp_path / "a.pth")
+    assert weights("check", tmp_path / "a.pth") == 0
+    assert "Mask2Former on ViT-Adapter" in capsys.readouterr().out

@@ -54,6 +54,8 @@ def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Ite
         yield from _flash3d(found)
     elif told == "dinov2":
         yield from _dinov2(found)
+    elif told == "m2f":
+        yield from _m2f(found)
     elif "decode_head.conv_seg.weight" in found.tensors:
         yield from _head(found)
     else:
@@ -159,3 +161,10 @@ def _head(found: Tensors) -> Iterator[Finding]:
     inside = {key.removeprefix("decode_head."): tensor for key, tensor in found.tensors.items()}
     load_strictly(head, inside, "an ADE20K head")
     yield "shapes", f"a head on {channels} channels, {classes} classes (ADE20K has 150)", classes == 150
+
+
+def _m2f(found: Tensors) -> Iterator[Finding]:
+    from garps_core.models.mask2former import mask2former_of
+
+    mask2former_of(found.tensors)
+    yield "shapes", "Mask2Former on ViT-Adapter, sizes as the file has them; its output is not checked here", True
