@@ -137,7 +137,11 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
     maximise = paper.maximise if settings.solver == "adam" else search if guess else solve.anneal
-    findings = [_finding(solution, x, y, known, guess, config) for solution in maximise(x, y, known, settings)]
+    findings = []
+    for solution in maximise(x, y, known, settings):
+        findings.append(_finding(solution, x, y, known, guess, config))
+        if findings[-1].convincing(settings):
+            break
     if not findings:
         shared = overlap(x, y, known.T, settings)
         return _too_little(shared, initial, settings)

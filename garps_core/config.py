@@ -174,6 +174,9 @@ class Alignment(Checked):
     guess_correlation: float = setting(
         0.76, "smallest correlation of the views' brightness when the start was a guess", low=-1, high=1
     )
+    enough_correlation: float = setting(
+        0.95, "a search ends with the first solution under which brightness is correlated so well", low=-1, high=1
+    )
     max_uncertainty: float = setting(
         0.05,
         "degenerate when scene points stay uncertain by more than this share of their range",

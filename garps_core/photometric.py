@@ -14,6 +14,7 @@ biweight. (Direct alignment as in Steinbruecker et al. 2011 and Kerl et al. 2013
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ class Sharpened:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """One resolution of a view: image, its slopes, depth and intrinsics; and points (n, 3) m with their brightness."""
 
     image: Float32Array
@@ -80,7 +81,7 @@ class _Overlay:
 
 
 @dataclass(frozen=True)
-class _Comparison:
+class Comparison:
     """Normal equations of one direction over the left twist of the pose that moves its points."""
 
     information: Array
@@ -106,24 +107,16 @@ def sharpen(
         return None
     if information <= 0:
         return _only_compared(source, target, T, covariance)
-    precision, at = np.linalg.inv(covariance), T
+    precision, at = np.asarray(np.linalg.inv(covariance), np.float64), T
     for step in GRIDS:
-        x, y = _grid(source, step), _grid(target, step)
-        for _ in range(STEPS):
-            seen = _both(x, y, at)
-            if seen is None:
-                break
-            weight = 0.5 * information * step**2
-            r = se3_log(at @ se3_inverse(T))
-            H, g = _summed(*seen, at)
-            move = np.linalg.solve(weight * H + precision, weight * g - precision @ r)
-            at = np.asarray(se3_exp(np.asarray(move, np.float64)) @ at)
-    seen = _both(x, y, at)
+        x, y = grid_of(source, step), grid_of(target, step)
+        at = climb_on(x, y, at, T, precision, 0.5 * information * step**2, STEPS)
+    seen = both_ways(x, y, at)
     if seen is None:
         return None
     f, b = seen
     weight = 0.5 * information
-    held = np.linalg.inv(weight * _summed(f, b, at)[0] + precision)
+    held = np.linalg.inv(weight * summed(f, b, at)[0] + precision)
     B, spread = -adjoint(se3_inverse(at)), held.copy()
     for pull in (f.of_depth, B.T @ b.of_depth):
         effect = held @ (weight * pull) * sigmas
@@ -132,8 +125,20 @@ def sharpen(
     return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement)
 
 
+def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
+    """Gauss-Newton steps on one pair of grids from pose `at`, held by a prior at T with the given precision (6, 6)."""
+    for _ in range(steps):
+        seen = both_ways(x, y, at)
+        if seen is None:
+            break
+        H, g = summed(*seen, at)
+        move = np.linalg.solve(weight * H + precision, weight * g - precision @ se3_log(at @ se3_inverse(T)))
+        at = np.asarray(se3_exp(np.asarray(move, np.float64)) @ at)
+    return at
+
+
 def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array) -> Sharpened | None:
-    x, y = _grid(source, GRIDS[-1]), _grid(target, GRIDS[-1])
+    x, y = grid_of(source, GRIDS[-1]), grid_of(target, GRIDS[-1])
     f, b = _overlaid(x, y, T), _overlaid(y, x, se3_inverse(T))
     if f is None or b is None:
         return None
@@ -147,7 +152,9 @@ def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:
     return np.ascontiguousarray(smooth[step // 2 :: step, step // 2 :: step]).astype(np.float32) / np.float32(255)
 
 
-def _grid(view: Frustum, step: int) -> _Grid:
+@lru_cache(maxsize=16)
+def grid_of(view: Frustum, step: int) -> Grid:
+    """Every `step`-th cell of what a camera saw; kept, because a search asks for the same again and again."""
     assert view.brightness is not None  # noqa: S101 - `sharpen` has looked
     image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
     image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step], np.float32)
@@ -162,7 +169,7 @@ def _grid(view: Frustum, step: int) -> _Grid:
         strongest = np.sort(np.argpartition(-strength, MAX_POINTS)[:MAX_POINTS])
         u, v = u[strongest], v[strongest]
     points = pixel_rays(K, u.astype(float), v.astype(float)) * depth[v, u].astype(float)[:, None]
-    return _Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float))
+    return Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float))
 
 
 def _on_one_surface(depth: Float32Array) -> npt.NDArray[np.bool_]:
@@ -172,19 +179,20 @@ def _on_one_surface(depth: Float32Array) -> npt.NDArray[np.bool_]:
     return np.asarray(there & (far - near < EDGE_RATIO * near))
 
 
-def _both(x: _Grid, y: _Grid, T: Array) -> tuple[_Comparison, _Comparison] | None:
+def both_ways(x: Grid, y: Grid, T: Array) -> tuple[Comparison, Comparison] | None:
+    """x under T against y, and y under the inverse against x; None when too little can be compared."""
     f = _compared(x, y, T)
     b = None if f is None else _compared(y, x, se3_inverse(T))
     return None if f is None or b is None else (f, b)
 
 
-def _summed(f: _Comparison, b: _Comparison, T: Array) -> tuple[Array, Array]:
+def summed(f: Comparison, b: Comparison, T: Array) -> tuple[Array, Array]:
     """Information and gradient of both directions over the left twist of T."""
     B = -adjoint(se3_inverse(T))
     return f.information + B.T @ b.information @ B, f.gradient + B.T @ b.gradient
 
 
-def _overlaid(x: _Grid, y: _Grid, T: Array) -> _Overlay | None:
+def _overlaid(x: Grid, y: Grid, T: Array) -> _Overlay | None:
     """Points of x on the pixels of y that they fall on; None when too few do, or all look alike."""
     moved = x.points @ T[:3, :3].T + T[:3, 3]
     pixel = _seen_at(moved, y)
@@ -198,7 +206,7 @@ def _overlaid(x: _Grid, y: _Grid, T: Array) -> _Overlay | None:
     return _Overlay(inside, moved[inside], pixel[inside], own, theirs, correlation, float(inside.mean()))
 
 
-def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
+def _compared(x: Grid, y: Grid, T: Array) -> Comparison | None:
     """Normal equations of the points of x against the pixels of y; None when too little can be compared."""
     seen = _overlaid(x, y, T)
     if seen is None:
@@ -215,10 +223,10 @@ def _compared(x: _Grid, y: _Grid, T: Array) -> _Comparison | None:
     JW = (J * weights[:, None]).T
     fields = T[:3, :3] @ shared_errors(x.points[seen.inside])
     of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
-    return _Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
+    return Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
 
 
-def _seen_at(moved: Array, y: _Grid) -> Array:
+def _seen_at(moved: Array, y: Grid) -> Array:
     """Pixels (n, 2) of y on which points (n, 3) fall; NaN outside, and where y's camera sees another surface."""
     height, width = y.image.shape
     z = np.maximum(moved[:, 2], 1e-3)

@@ -1,50 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The start is a guess: several coarse beginnings around it, ranked by the objective, the best ones followed.
+"""The start is a guess: coarse beginnings all around it, by shape and by sight; the best of both are followed.
 
 Kernels of a coarse rung are blurred by decimetres, so that surfaces pull from where a guess leaves them. Even so an
-optimum is only found from some tens of degrees, hence beginnings that are turned about the camera's axes. The prior
+optimum is only found from some tens of degrees, hence beginnings that are turned about the camera's axes, ranked by the
+objective. Brightness finds its own (`glance.py`), in places with little shape; bare walls are found by shape. The prior
 holds all of them together: it is as wide as the guess.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import islice, zip_longest
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from garps_core.config import Alignment
 from garps_core.geometry import Array, se3_inverse, se3_log
+from garps_core.glance import glances
 from garps_core.joint import State
 from garps_core.pairing import Cloud, overlap
 from garps_core.solve import Belief, Solution, descend, seen_closely
 
 RINGS = ((1.5, 6, 0.0), (3.0, 8, 0.5))
-"""Beginnings are turned by so many sigmas of the guess's rotation, about so many axes across the view, the first
-so many steps from x."""
+"""Where the objective's descents begin (`beginnings`)."""
+FINE_RINGS = tuple((0.5 * ring, 12, 0.5 * (ring % 2)) for ring in range(1, 7))
+"""Where those of brightness begin: their basins are smaller."""
 SAME_RAD = 0.1
-"""Beginnings that end closer to each other than this (rad, m) are one."""
+"""Poses to follow that are closer to each other than this (rad, m) are one."""
 
 
-def search(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[Solution]:
-    """Maximum a posteriori alignments from a guess, the most promising first; none when too little is visible."""
+def search(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> Iterator[Solution]:
+    """Maximum a posteriori alignments from a guess, the most promising first, found one by one as they are asked for.
+
+    At most `search_followed`; none when too little is visible.
+    """
+    for at in islice(_distinct(_promising(source, target, known, settings)), settings.search_followed):
+        end = descend(source, target, at, known, settings.search_ladder, settings)
+        if end is not None:
+            yield seen_closely(end, source, target, settings)
+
+
+def _promising(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> Iterator[State]:
+    """The best by sight, then the next by shape and by sight in turn; shape is asked only if one is not enough."""
+    by_sight = [_at(T, known) for T in _seen_from_around(source, target, known)]
+    yield from by_sight[:1]
+    for pair in zip_longest(_by_shape(source, target, known, settings), by_sight[1:]):
+        yield from (at for at in pair if at is not None)
+
+
+def _by_shape(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[State]:
+    """Where the objective, blurred by decimetres, leads from around the guess, the best first."""
     begun = [
         found
-        for T in beginnings(known)
+        for T in beginnings(known, RINGS)
         if (found := descend(source, target, _at(T, known), known, settings.search, settings)) is not None
     ]
     begun.sort(key=lambda found: -_merit(found, source, target, settings))
-    followed = [
-        seen_closely(end, source, target, settings)
-        for found in _distinct(begun)[: settings.search_followed]
-        if (end := descend(source, target, found.at, known, settings.search_ladder, settings)) is not None
-    ]
-    return sorted(followed, key=lambda end: -_merit(end, source, target, settings))
+    return [found.at for found in begun]
 
 
-def beginnings(known: Belief) -> list[Array]:
-    """Poses to begin from: the guess itself, and it turned about axes across the line of sight."""
+def _seen_from_around(source: Cloud, target: Cloud, known: Belief) -> list[Array]:
+    if source.frustum is None or target.frustum is None:
+        return []
+    return glances(source.frustum, target.frustum, known, beginnings(known, FINE_RINGS))
+
+
+def beginnings(known: Belief, rings: tuple[tuple[float, int, float], ...]) -> list[Array]:
+    """Poses to begin from: the guess itself, and it turned about axes across the line of sight.
+
+    A ring is turned by so many sigmas of the guess's rotation, about so many axes, the first so many steps from x.
+    """
     sigma = float(np.sqrt(np.trace(np.linalg.inv(known.precision)[3:, 3:]) / 3))
     poses = [known.T]
-    for turns, count, first in RINGS:
+    for turns, count, first in rings:
         for angle in 2 * np.pi * (np.arange(count) + first) / count:
             T = np.eye(4)
             T[:3, :3] = Rotation.from_rotvec(turns * sigma * np.array([np.cos(angle), np.sin(angle), 0])).as_matrix()
@@ -61,9 +90,10 @@ def _merit(found: Solution, source: Cloud, target: Cloud, settings: Alignment) -
     return found.data.value * overlap(source, target, found.T, settings)
 
 
-def _distinct(found: list[Solution]) -> list[Solution]:
-    kept: list[Solution] = []
-    for one in found:
-        if all(np.linalg.norm(se3_log(one.T @ se3_inverse(other.T))) > SAME_RAD for other in kept):
-            kept.append(one)
-    return kept
+def _distinct(states: Iterable[State]) -> Iterator[State]:
+    """Without those that lie by an earlier one."""
+    kept: list[State] = []
+    for at in states:
+        if all(np.linalg.norm(se3_log(at.T @ se3_inverse(other.T))) > SAME_RAD for other in kept):
+            kept.append(at)
+            yield at

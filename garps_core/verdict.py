@@ -40,6 +40,10 @@ class Finding:
             return self.seen.correlation * self.seen.share
         return self.solution.data.value * self.overlap
 
+    def convincing(self, settings: Alignment) -> bool:
+        """Brightness agrees so well that no other solution needs to be looked for."""
+        return self.seen is not None and self.seen.correlation >= settings.enough_correlation
+
 
 def relative_uncertainty(source: Mixture, T: Float64Array, covariance: Float64Array) -> float:
     """Sigma of a typical scene point along its most uncertain direction, as a share of its range in the target."""

@@ -200,7 +200,7 @@ def test_a_ramp_of_brightness_says_nothing_about_the_shift_along_it():
 @pytest.mark.parametrize("twist", STARTS, ids="+-")
 def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     """At fixed weights and fixed points, with the best exposure; slopes are smoothed, so not to the last digit."""
-    x, y = (photometric._grid(view, 1) for view in views)
+    x, y = (photometric.grid_of(view, 1) for view in views)
     T = se3_exp(0.5 * twist) @ TRUTH
 
     def pixels(pose):
