@@ -79,12 +79,12 @@ def pairs_of(
     return _recorded(part.depth, part.set, data, half, limit, seed)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)
 def _recorded(depth: str, name: str, data: Path, half: str, limit: int | None, seed: int) -> list[Pair]:
     pairs = load_pairs(name, data, limit, half)
     return [with_monocular_depth(pair, seed) for pair in pairs] if depth == MONOCULAR else pairs
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=4)
 def _generated(split: str, folder: Path, console: Console) -> list[Pair]:
     return bare.load_with_bar(split, folder, console).pairs
