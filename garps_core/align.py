@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator
 
 import numpy as np
@@ -13,11 +12,11 @@ import torch
 
 from garps_core import paper, solve
 from garps_core.config import Alignment, Config
-from garps_core.errors import InitialisationError, InputError
+from garps_core.errors import InitialisationError, InputError, ModelError, WeightsError
 from garps_core.initialise import identity, initialise
 from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
 from garps_core.photometric import sharpen
-from garps_core.reconstruct import reconstruct
+from garps_core.reconstruct import mixtures_of, with_depth
 from garps_core.search import search
 from garps_core.solve import MIN_ROWS, Belief, Solution
 from garps_core.systematic import DEPTH_MODES, shared_sigmas
@@ -35,31 +34,44 @@ def estimate_relative_pose(
     """Estimate the pose of the source camera in the target camera's frame, in metres, with its covariance.
 
     Args:
-        source, target: two views of the same static scene, with metric depth.
+        source, target: two views of the same static scene; depth, where `config.reconstruction` wants a sensor's.
         config: settings; the default preset when None.
         prior: what is known of the pose beforehand, if anything; it enters the estimate with its covariance.
     Returns:
         PoseEstimate; when no pose could be had its status and reason say why and T_target_source is None.
     Raises:
         ReconstructionError: a view holds too little depth.
-        ConfigError: the device is not there.
+        ConfigError: the device is not there, or settings do not go together.
+        WeightsError: a network's weights are missing or not what they should be.
     """
+    return estimate_with_mixtures(source, target, config, prior)[0]
+
+
+def estimate_with_mixtures(
+    source: View, target: View, config: Config | None = None, prior: Prior | None = None
+) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
+    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
     config = config or Config()
     checked_device(config.device)
-    begin = time.perf_counter()
-    with ThreadPoolExecutor(2) as pool:
-        x, y = pool.map(reconstruct, (source, target), (config, config))
-    lifted = time.perf_counter()
+    spent, begin = {}, time.perf_counter()
     try:
-        starts = initialise(source, target, config, prior)
+        views = with_depth((source, target), config)
+        if views != [source, target]:  # only a network takes time
+            spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
+        x, y = mixtures_of(views, config)
+    except ModelError as failure:
+        if isinstance(failure, WeightsError):  # a mistake of whoever set this up, not of these images
+            raise
+        return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
+    spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
+    try:
+        starts = initialise(views[0], views[1], config, prior)
     except InitialisationError as failure:
-        return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds={"reconstruct": lifted - begin})
-    initialised = time.perf_counter()
+        return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)
+    spent["initialise"], begin = time.perf_counter() - begin, time.perf_counter()
     estimate = _best_of(x, y, starts, config)
-    estimate.seconds.update(
-        reconstruct=lifted - begin, initialise=initialised - lifted, align=time.perf_counter() - initialised
-    )
-    return estimate
+    estimate.seconds.update(spent, align=time.perf_counter() - begin)
+    return estimate, (x, y)
 
 
 def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:

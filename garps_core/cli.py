@@ -6,29 +6,31 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
 from garps_core import __version__
-from garps_core.align import estimate_relative_pose
+from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.config import PRESETS, Config
+from garps_core.config import METHODS, PRESETS, Config
 from garps_core.errors import GarpsError, InputError
 from garps_core.files import read_view
+from garps_core.initialise import identity
 from garps_core.pairing import checked_device
-from garps_core.reconstruct import reconstruct
 from garps_core.report import as_json, as_text
 from garps_core.settings import changed_config
-from garps_core.types import PoseEstimate, Prior, View
+from garps_core.splat_reader import read_splats
+from garps_core.types import Mixture, PoseEstimate, Prior, View
 from garps_core.weights_cli import app as weights_app
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
+Found = tuple[PoseEstimate, tuple[Mixture, Mixture] | None]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
     add_completion=False,
@@ -72,9 +74,11 @@ def _root(
 
 @app.command()
 def align(
-    source: Annotated[Path, typer.Argument(help="Image of the source camera.", metavar="SRC")],
-    target: Annotated[Path, typer.Argument(help="Image of the target camera.", metavar="TGT")],
-    K: Annotated[Four, typer.Option("--K", help="Pinhole intrinsics in pixels.", metavar="FX FY CX CY")],
+    source: Annotated[Path, typer.Argument(help="Image of the source camera, or splats (.ply).", metavar="SRC")],
+    target: Annotated[Path, typer.Argument(help="Image of the target camera, or splats (.ply).", metavar="TGT")],
+    K: Annotated[
+        Four | None, typer.Option("--K", help="Pinhole intrinsics in pixels, of images.", metavar="FX FY CX CY")
+    ] = None,
     K_target: Annotated[
         Four | None, typer.Option("--K-target", help="Of the target, if different.", metavar="FX FY CX CY")
     ] = None,
@@ -91,7 +95,12 @@ def align(
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
     ] = None,
-    preset: Annotated[str, typer.Option(help=f"One of {', '.join(PRESETS)}.")] = "default",
+    preset: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; without depth monocular]")
+    ] = None,
+    reconstruction: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(METHODS)}. [auto: the depth, else a network's]")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
@@ -104,23 +113,25 @@ def align(
 
     Points of the source go to the target as x_target = R x_source + t, in metres; optical frames: x right, y down,
     z forward. Prints translation, rotation, their sigmas and how far to trust them.
-
     \b
     Example:
       garps align a.png b.png --K 525 525 319.5 239.5 \\
           --depth-source a_depth.png --depth-target b_depth.png --figure pair.png
+      garps align a.png b.png --K 525 525 319.5 239.5        # by a network, see `garps weights`
+      garps align a.ply b.ply --prior "0.2 0 0 0 0 0 1"      # splats of any producer, metres
     \b
     Exit code: 0 = converged, 1 = no pose to be trusted (the reason is printed), 2 = wrong input.
     """
-    config = _configured(preset, set_ or [], device)
-    start = _prior(prior, prior_sigma)
-    views = (
-        read_view(source, _intrinsics("--K", K), depth_source, depth_scale),
-        read_view(target, _intrinsics("--K-target", K_target or K), depth_target, depth_scale),
-    )
-    estimate = estimate_relative_pose(*views, config, start)
+    files, depths = (source, target), (depth_source, depth_target)
+    splats, start = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
+    preset = preset or ("default" if splats or any(depths) else "monocular")
+    config = _configured(preset, set_ or [], device, reconstruction)
+    if splats:
+        estimate, mixtures = _aligned_splats(files, start, config)
+    else:
+        estimate, mixtures = estimate_with_mixtures(*_views(files, depths, (K, K_target), depth_scale), config, start)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
-    _write_extras(estimate, views, config, figure, ply)
+    _write_extras(estimate, mixtures, figure, ply)
     return 0 if estimate.ok else 1
 
 
@@ -139,8 +150,33 @@ def doctor() -> int:
     return 0 if healthy else 1
 
 
-def _configured(preset: str, changes: list[str], device: str | None) -> Config:
+def _are_splats(files: tuple[Path, Path], method: str | None) -> bool:
+    splats = [file.suffix.lower() == ".ply" for file in files]
+    if any(splats) != all(splats) or (method is not None and (method == "ply") != all(splats)):
+        raise InputError(
+            f"{files[0]} and {files[1]}{f' with --reconstruction {method}' if method else ''}: expected two images, or "
+            "two splat files that end in .ply"
+        )
+    return all(splats)
+
+
+def _aligned_splats(files: tuple[Path, Path], start: Prior | None, config: Config) -> Found:
+    x, y = (read_splats(file) for file in files)
+    return align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y)
+
+
+def _views(
+    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], Ks: tuple[Four | None, Four | None], scale: Any
+) -> tuple[View, View]:
+    if Ks[0] is None:
+        raise InputError("--K is missing: expected FX FY CX CY in pixels, from the camera's calibration")
+    of_source, of_target = _intrinsics("--K", Ks[0]), _intrinsics("--K-target", Ks[1] or Ks[0])
+    return read_view(files[0], of_source, depths[0], scale), read_view(files[1], of_target, depths[1], scale)
+
+
+def _configured(preset: str, changes: list[str], device: str | None, method: str | None) -> Config:
     config = changed_config(Config.preset(preset), changes)
+    config = config if method is None else config.replace({"reconstruction.method": method})
     config = config if device is None else config.replace({"device": device})
     checked_device(config.device)
     return config
@@ -182,14 +218,13 @@ def _prior(pose: str | None, sigma: str | None) -> Prior | None:
 
 
 def _write_extras(
-    estimate: PoseEstimate, views: tuple[View, View], config: Config, figure: Path | None, ply: Path | None
+    estimate: PoseEstimate, mixtures: tuple[Mixture, Mixture] | None, figure: Path | None, ply: Path | None
 ) -> None:
     if figure is None and ply is None:
         return
-    if estimate.T_target_source is None:
+    if estimate.T_target_source is None or mixtures is None:
         print("garps: note: no pose, so no picture and no PLY files are written", file=sys.stderr)
         return
-    mixtures = reconstruct(views[0], config), reconstruct(views[1], config)
     if ply is not None:
         from garps_core.splats import write_aligned
 

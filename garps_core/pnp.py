@@ -19,7 +19,7 @@ from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, point_jacobian, project, se3_exp, se3_inverse, transform
-from garps_core.reconstruct import depth_sigma
+from garps_core.lift import depth_sigma
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist

@@ -131,6 +131,7 @@ class Status(enum.Enum):
     INCONSISTENT = "inconsistent"  #: the data pulls further from the initial pose than its covariance allows
     POOR_FIT = "poor_fit"  #: too few partners, or brightness disagrees: most likely a wrong optimum; a pose is given
     LOW_OVERLAP = "low_overlap"  #: too few components of one view are visible in the other
+    NO_MIXTURE = "no_mixture"  #: a network could not do its part: too little memory, or values that are not finite
     NO_INITIAL_POSE = "no_initial_pose"  #: nothing to start from
 
 
@@ -157,7 +158,7 @@ class PoseEstimate:
     agreement: float = float("nan")
     """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Wall time per stage: reconstruct, initialise, align."""
+    """Wall time per stage: depth (the network's), reconstruct, initialise, align."""
 
     @property
     def ok(self) -> bool:

@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 GROUPS = {
     "node": ("The node", "What is subscribed, paired and published."),
+    "reconstruction": ("`reconstruction`", "What turns a view into a mixture, and which weights networks use."),
     "lifting": ("`lifting`", "How a pixel with depth becomes a Gaussian: the sensor model."),
     "start": ("`start`", "Where the alignment starts."),
     "alignment": ("`alignment`", "The objective and how it is maximised; what a pose must hold to be published."),

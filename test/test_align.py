@@ -27,7 +27,7 @@ from garps_core.metrics import nees, rotation_error_deg, translation_error_m
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 PUBLIC = {
-    "Config": ["lifting", "start", "alignment", "device", "dtype", "seed"],
+    "Config": ["reconstruction", "lifting", "start", "alignment", "device", "dtype", "seed"],
     "ConfigError": None,
     "GarpsError": None,
     "InputError": None,
@@ -68,7 +68,7 @@ def test_the_public_interface_is_exactly_this():
 
 def test_every_status_says_what_it_means():
     assert {status.value for status in Status} == {
-        "converged", "max_iterations", "degenerate", "inconsistent", "low_overlap", "no_initial_pose",
+        "converged", "max_iterations", "degenerate", "inconsistent", "low_overlap", "no_mixture", "no_initial_pose",
         "poor_fit",
     }  # fmt: skip
     for status in Status:

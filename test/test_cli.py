@@ -152,7 +152,7 @@ def test_no_pose_is_code_1_with_the_reason(
     files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = PoseEstimate(Status.NO_INITIAL_POSE, "4 matches, 12 are needed")
-    monkeypatch.setattr(cli, "estimate_relative_pose", lambda *_: none)
+    monkeypatch.setattr(cli, "estimate_with_mixtures", lambda *_: (none, None))
     assert cli.main(arguments(files, "--figure", str(tmp_path / "a.png"))) == 1
     captured = capsys.readouterr()
     assert "no_initial_pose: 4 matches" in captured.out
@@ -167,11 +167,11 @@ def test_no_pose_is_code_1_with_the_reason(
 def test_a_prior_is_read_in_ros_quaternion_order(files: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Prior] = []
 
-    def keep(_source: object, _target: object, _config: object, prior: Prior) -> PoseEstimate:
+    def keep(_source: object, _target: object, _config: object, prior: Prior) -> tuple[PoseEstimate, None]:
         seen.append(prior)
-        return PoseEstimate(Status.NO_INITIAL_POSE, "")
+        return PoseEstimate(Status.NO_INITIAL_POSE, ""), None
 
-    monkeypatch.setattr(cli, "estimate_relative_pose", keep)
+    monkeypatch.setattr(cli, "estimate_with_mixtures", keep)
     quarter = "-1 2 3 0 0 0.70710678 0.70710678"
     assert cli.main([*without(arguments(files), "--prior"), "--prior", quarter, "--prior-sigma", "0.2 0.1"]) == 1
     T = seen[0].T_target_source

@@ -11,8 +11,8 @@ from surfaces import SIZE, K, grey_at, look
 from garps_core import Config, View, reconstruct
 from garps_core.config import Lifting
 from garps_core.geometry import pixel_rays, project
+from garps_core.lift import FRUSTUM_STEP_PX, depth_sigma
 from garps_core.pairing import to_cloud, visible
-from garps_core.reconstruct import FRUSTUM_STEP_PX, depth_sigma
 
 UNSMOOTHED = Config().replace({"lifting.smoothing_px": 0})
 VIEW = look()

@@ -13,8 +13,8 @@ from surfaces import FREE, TRUTH, disturbed, look, off, random_pose, two_views
 
 from garps_core import Config, Mixture, Prior, align_mixtures, reconstruct
 from garps_core.geometry import se3_exp, se3_inverse
+from garps_core.lift import depth_sigma
 from garps_core.metrics import pose_error
-from garps_core.reconstruct import depth_sigma
 from garps_core.systematic import FIELD_SLOPE, shared_errors, shared_sigmas
 from garps_core.uncertainty import inverted, ros_from_twist, twist_from_ros
 

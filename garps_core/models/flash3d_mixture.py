@@ -18,10 +18,10 @@ from torch import Tensor
 from garps_core.checks import Float32Array, Float64Array, IntArray
 from garps_core.config import Lifting
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError
+from garps_core.lift import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.models.depth_anything import DTYPES
 from garps_core.models.flash3d import HEIGHT, LAYERS, PAD, PADDED, WIDTH, Flash3D, GaussianMaps
 from garps_core.models.resampling import lanczos, nearest_index
-from garps_core.reconstruct import MIN_COMPONENTS, _frustum, _in_range, _z_order
 from garps_core.splats import SH_CONSTANT
 from garps_core.types import Mixture, View
 
@@ -231,7 +231,7 @@ def gaussians_to_mixture(
         weights=gaussians.opacities[kept] * (area if lifting.weighting == "area" else np.float32(1)),
         colours=gaussians.colours[kept],
         labels=None if labels is None else labels_of(labels, view, gaussians.index[kept]),
-        frustum=_frustum(view, _in_range(view.depth, lifting)),
+        frustum=frustum_of(view, in_range(view.depth, lifting)),
     )
 
 
@@ -253,7 +253,7 @@ def definite(covariances: Float32Array) -> Float32Array:
 
 def _place_on_curve(index: IntArray) -> IntArray:
     """Position along the Z-order curve of the padded picture; the layers of a pixel follow each other."""
-    rows, columns = _z_order(*PADDED)
+    rows, columns = z_order(*PADDED)
     place = np.empty(len(rows), np.int64)
     place[rows * PADDED[1] + columns] = np.arange(len(rows))
     layer, pixel = np.divmod(index, len(rows))

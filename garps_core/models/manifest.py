@@ -8,7 +8,8 @@ on it is checked.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from garps_core.errors import WeightsError
@@ -200,3 +201,26 @@ def of_file(file: str) -> Weights | None:
     """The entry whose file, at the source or in the weights folder, has this name."""
     known = {weights.local: weights for weights in ALL}
     return known.get(file)
+
+
+def range_of(file: str, metadata: Mapping[str, str], variant: str, option: str) -> float:
+    """Largest depth (m) of a metric depth network, which its tensors do not tell.
+
+    Args:
+        file: name of the file. metadata: what is stored in it.
+        variant: indoor or outdoor, as the user says; "" = as the name or the metadata says.
+        option: where the user says it.
+    Raises:
+        WeightsError: nobody says it, they contradict each other, or the file is known to be of a relative model.
+    """
+    if re.fullmatch(r"depth_anything_v2_vit[sblg]\.(pth|safetensors)", file):
+        raise WeightsError(f"{file} is the name of a relative model: expected a metric one, as in `garps weights list`")
+    known, told = of_file(file), metadata.get("max_depth_m")
+    if known is not None and known.max_depth_m and variant in ("", known.variant):
+        return known.max_depth_m
+    if told in ("20", "80") and variant in ("", metadata.get("variant")):
+        return float(told)
+    if known is not None or told or variant not in MAX_DEPTH_M:
+        of = known.variant if known else metadata.get("variant", "indoor or outdoor")
+        raise WeightsError(f"{option} is {variant or 'missing'}: expected {of} for {file}")
+    return MAX_DEPTH_M[variant]

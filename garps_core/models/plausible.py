@@ -17,7 +17,7 @@ from garps_core.checks import Float32Array
 from garps_core.errors import WeightsError
 from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.loading import check_finite, kind_of, load_strictly, recognised
-from garps_core.models.manifest import MAX_DEPTH_M, of_file
+from garps_core.models.manifest import of_file, range_of
 
 Finding = tuple[str, str, bool]
 Picture = npt.NDArray[np.uint8]
@@ -49,7 +49,7 @@ def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Ite
     check_finite(found.tensors, str(path))
     yield "values", "all finite", True
     if told == "depth_anything":
-        yield from _depth_anything(path, found, _max_depth(path, found, variant))
+        yield from _depth_anything(path, found, range_of(path.name, found.metadata, variant, "--variant"))
     elif told == "flash3d":
         yield from _flash3d(found)
     elif told == "dinov2":
@@ -79,18 +79,6 @@ def drawn_room(height: int = 240, width: int = 320) -> tuple[Picture, Float32Arr
     grain = np.random.default_rng(0).normal(0, 4, (height, width, 3))
     rgb = colours * (tiles * light)[..., None] + grain
     return np.clip(rgb, 0, 255).astype(np.uint8), depth.astype(np.float32)
-
-
-def _max_depth(path: Path, found: Tensors, variant: str) -> float:
-    known, told = of_file(path.name), found.metadata.get("max_depth_m")
-    if known is not None and known.max_depth_m and variant in ("", known.variant):
-        return known.max_depth_m
-    if told in ("20", "80") and variant in ("", found.metadata.get("variant")):
-        return float(told)
-    if known is not None or told or variant not in MAX_DEPTH_M:
-        of = known.variant if known else found.metadata.get("variant", "indoor or outdoor")
-        raise WeightsError(f"--variant is {variant or 'missing'}: expected {of} for {path.name}")
-    return MAX_DEPTH_M[variant]
 
 
 def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Finding]:

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The networks that are in use: found by name or file, loaded once, asked for depth, Gaussians or labels."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from garps_core.checks import Float32Array, IntArray
+from garps_core.config import Config
+from garps_core.errors import ReconstructionError, WeightsError
+from garps_core.models import mask2former, semantics
+from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of
+from garps_core.models.files import Tensors, read_tensors
+from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
+from garps_core.models.manifest import BY_NAME, named, of_file, range_of
+from garps_core.models.store import default, installed
+from garps_core.pairing import checked_device
+from garps_core.types import View
+
+AT_THE_END = 0.98
+"""Share of the network's largest depth from which on a pixel is as far as the network can say."""
+
+Made = TypeVar("Made")
+_LOCK = threading.RLock()
+
+
+def depths(views: Sequence[View], config: Config) -> list[Float32Array]:
+    """Metric depth of each view, HxW float32 m along z, by the depth network of the settings, in one pass.
+
+    Raises:
+        WeightsError: none installed, or not what it should be. ModelError: too little memory, not finite.
+        ReconstructionError: most of a picture lies at the end of the network's range.
+    """
+    settings = config.reconstruction
+    network = depth_network(settings.depth_weights, settings.scene)
+    found = depth_of(
+        network,
+        [view.rgb for view in views],
+        depth_scale=settings.depth_scale,
+        fx=[float(view.K[0, 0]) for view in views] if settings.focal_correction else None,
+        device=config.device,
+        dtype=dtype_of(config),
+    )
+    for view, depth in zip(views, found, strict=True):
+        _check_range(view, depth, network.max_depth * settings.depth_scale)
+    return found
+
+
+def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
+    far = float(np.mean(depth >= AT_THE_END * largest_m))
+    if far > 0.5:
+        raise ReconstructionError(
+            f"{far:.0%} of the network's depth of {view.frame_id or 'a view'} is {largest_m:g} m, all it can say: "
+            "expected rooms for indoor weights, streets for outdoor ones, and no relative model's"
+        )
+
+
+def labels(rgb: RGBImage, config: Config) -> IntArray:
+    """Class of every pixel, HxW, by the segmentation of the settings. Raises WeightsError, ModelError."""
+    settings = config.reconstruction
+    network = segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
+    network.to(checked_device(config.device))
+    if isinstance(network, mask2former.Mask2Former):
+        return mask2former.segment_by_masks(network, rgb)
+    return semantics.segment(network, rgb, dtype=dtype_of(config))
+
+
+def dtype_of(config: Config) -> torch.dtype:
+    """What the networks compute in."""
+    return {"float16": torch.float16, "bfloat16": torch.bfloat16}.get(
+        config.reconstruction.network_dtype, torch.float32
+    )
+
+
+def once(load: Callable[..., Made]) -> Callable[..., Made]:
+    """Keep the last network that was loaded so; two threads that want it at once load it once."""
+    kept = lru_cache(maxsize=1)(load)
+
+    def under_lock(*given: str) -> Made:
+        with _LOCK:
+            return kept(*given)
+
+    return under_lock
+
+
+@once
+def depth_network(weights: str, scene: str) -> DepthAnythingV2:
+    """Depth Anything V2 from a name, a file or, for "", what is installed; scene = any, indoor or outdoor."""
+    variant = "" if scene == "any" else scene
+    path, read = _tensors(weights, "depth_anything", variant)
+    return built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
+
+
+@once
+def _flash3d(weights: str) -> Flash3D:
+    return flash3d_network(flash3d_tensors(_tensors(weights, "flash3d")[1].tensors)[0])
+
+
+def flash3d(weights: str, device: str) -> Flash3D:
+    """Flash3D from a name, a file or, for "", what is installed; on the device."""
+    network: Flash3D = _flash3d(weights).to(checked_device(device))
+    return network
+
+
+@once
+def segmenter(kind: str, weights: str, backbone: str) -> semantics.Segmenter | mask2former.Mask2Former:
+    """A segmentation of kind linear, ms or m2f from names, files or, for "", what is installed."""
+    if kind == "m2f":
+        return mask2former.mask2former_of(_tensors(weights, "m2f")[1].tensors)
+    path, head = _tensors(weights, f"ade20k_{kind}")
+    known = of_file(path.name)
+    if not backbone and known is not None:
+        backbone = next(one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size)
+    return semantics.segmenter_of(_tensors(backbone, "dinov2")[1].tensors, head.tensors)
+
+
+def _tensors(weights: str, kind: str, variant: str = "") -> tuple[Path, Tensors]:
+    """Path and content of weights that are given by name or file; "" = the first that is installed."""
+    name = weights or default(kind, variant).name
+    if name not in BY_NAME:
+        path = Path(weights).expanduser()
+        if path.suffix not in (".pth", ".pt", ".safetensors"):
+            named(name)  # raises, with the nearest names
+        return path, read_tensors(path, kind=kind)
+    entry, there = named(name), installed(name)
+    if entry.kind != kind:
+        raise WeightsError(f"{name} are weights of {entry.kind}: expected some of {kind}; see `garps weights list`")
+    if there is None:
+        raise WeightsError(f"{name} is not installed: run `garps weights fetch {name}`, or name another file")
+    return there, read_tensors(there, max_bytes=entry.bytes or entry.bytes_bound, sha256=entry.sha256, kind=kind)
