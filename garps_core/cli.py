@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +31,7 @@ from garps_core.weights_cli import app as weights_app
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
-Found = tuple[PoseEstimate, tuple[Mixture, Mixture] | None]
+Estimator = Callable[[Config, Prior | None], tuple[PoseEstimate, tuple[Mixture, Mixture] | None]]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
     add_completion=False,
@@ -113,6 +114,7 @@ def align(
 
     Points of the source go to the target as x_target = R x_source + t, in metres; optical frames: x right, y down,
     z forward. Prints translation, rotation, their sigmas and how far to trust them.
+
     \b
     Example:
       garps align a.png b.png --K 525 525 319.5 239.5 \\
@@ -126,10 +128,8 @@ def align(
     splats, start = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     preset = preset or ("default" if splats or any(depths) else "monocular")
     config = _configured(preset, set_ or [], device, reconstruction)
-    if splats:
-        estimate, mixtures = _aligned_splats(files, start, config)
-    else:
-        estimate, mixtures = estimate_with_mixtures(*_views(files, depths, (K, K_target), depth_scale), config, start)
+    found = _of_splats(files) if splats else _of_views(_views(files, depths, (K, K_target), depth_scale))
+    estimate, mixtures = found(config, start)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
     _write_extras(estimate, mixtures, figure, ply)
     return 0 if estimate.ok else 1
@@ -160,9 +160,13 @@ def _are_splats(files: tuple[Path, Path], method: str | None) -> bool:
     return all(splats)
 
 
-def _aligned_splats(files: tuple[Path, Path], start: Prior | None, config: Config) -> Found:
+def _of_splats(files: tuple[Path, Path]) -> Estimator:
     x, y = (read_splats(file) for file in files)
-    return align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y)
+    return lambda config, start: (align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y))
+
+
+def _of_views(views: tuple[View, View]) -> Estimator:
+    return lambda config, start: estimate_with_mixtures(*views, config, start)
 
 
 def _views(
