@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.config import METHODS, PRESETS, Config
+from garps_core.config import METHODS, PRESETS, Config, Reconstruction
 from garps_core.errors import GarpsError, InputError
 from garps_core.files import read_view
 from garps_core.initialise import identity
@@ -128,7 +129,10 @@ def align(
     splats, start = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     preset = preset or ("default" if splats or any(depths) else "monocular")
     config = _configured(preset, set_ or [], device, reconstruction)
-    found = _of_splats(files) if splats else _of_views(_views(files, depths, (K, K_target), depth_scale))
+    of_images = any((*depths, K, K_target))
+    found = (
+        _of_splats(files, config, of_images) if splats else _of_views(_views(files, depths, (K, K_target), depth_scale))
+    )
     estimate, mixtures = found(config, start)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
     _write_extras(estimate, mixtures, figure, ply)
@@ -160,7 +164,14 @@ def _are_splats(files: tuple[Path, Path], method: str | None) -> bool:
     return all(splats)
 
 
-def _of_splats(files: tuple[Path, Path]) -> Estimator:
+def _of_splats(files: tuple[Path, Path], config: Config, of_images: bool) -> Estimator:
+    asked = replace(config.reconstruction, method="ply") != Reconstruction(method="ply")
+    if of_images or asked or config.reconstruction.method not in ("auto", "ply"):
+        raise InputError(
+            "splat files come with --K, depth files or settings of reconstruction: expected none, nothing is to be "
+            "reconstructed; leave them out"
+        )
+
     x, y = (read_splats(file) for file in files)
     return lambda config, start: (align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y))
 

@@ -13,6 +13,9 @@ from garps_core.compiled import Float32, Int64, loop
 
 PER_CELL = 2.0
 """Partners in a cell, on average."""
+MOST_ROWS = 40_000
+"""With more rows the tree is faster: a row without a partner nearby looks through all the cells around it, and they
+are the more, the denser the partners."""
 
 
 @loop

@@ -165,7 +165,8 @@ def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
     moved = like @ R.T + t
     them = partners.means
-    if on_compiled_path(like) and len(them) and float(them[:, 2].min()) > NEAREST_Z_M:
+    few = len(like) <= neighbours.MOST_ROWS
+    if few and on_compiled_path(like) and len(them) and float(them[:, 2].min()) > NEAREST_Z_M:
         index, distance = neighbours.nearest(moved.numpy(), them.contiguous().numpy(), k, depth_weight)
         return torch.from_numpy(index), torch.from_numpy(distance)
     if depth_weight < 1:

@@ -69,15 +69,15 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
 def mixture_of(view: View, config: Config) -> Mixture:
     """The mixture of a view `with_depth`. Raises as `reconstruct`."""
     settings = config.reconstruction
-    if settings.method != "flash3d" and settings.semantics == "none":
-        return lift(view, config.lifting)
+    mixture = None if settings.method == "flash3d" else lift(view, config.lifting)
+    if mixture is not None and settings.semantics == "none":
+        return mixture
     from garps_core.models import loaded
     from garps_core.models.flash3d_mixture import gaussians_to_mixture, predict_gaussians
     from garps_core.models.semantics import labelled
 
     labels = None if settings.semantics == "none" else loaded.labels(view.rgb, config)
-    if settings.method != "flash3d":
-        mixture = lift(view, config.lifting)
+    if mixture is not None:
         return mixture if labels is None else labelled(mixture, labels, view.K)
     gaussians = predict_gaussians(
         loaded.flash3d(settings.flash3d_weights, config.device), view, settings.drop_border, loaded.dtype_of(config)

@@ -23,6 +23,7 @@ from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import vit
 from garps_core.models.dpt import DptHead, Grid, enlarged
 from garps_core.models.loading import load_strictly
+from garps_core.models.manifest import MAX_DEPTH_M
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
 from garps_core.pairing import checked_device
 
@@ -43,8 +44,6 @@ HEADS: Mapping[str, HeadSize] = {
     "vitb": HeadSize((2, 5, 8, 11), (96, 192, 384, 768), 128),
     "vitl": HeadSize((4, 11, 17, 23), (256, 512, 1024, 1024), 256),
 }
-MAX_DEPTH: Mapping[str, float] = {"indoor": 20.0, "outdoor": 80.0}
-"""Metres, by what the model was trained on: Hypersim (indoor) and Virtual KITTI (outdoor)."""
 SHORT_SIDE = 518
 """Pixels of the shorter side of the network's input."""
 LONGEST_SIDE = 8 * SHORT_SIDE
@@ -80,7 +79,7 @@ def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnything
     """
     if not (np.isfinite(max_depth) and max_depth > 0):
         raise ConfigError(
-            f"max_depth = {max_depth:g}: expected metres above 0, {MAX_DEPTH} as the weights were trained"
+            f"max_depth = {max_depth:g}: expected metres above 0, {MAX_DEPTH_M} as the weights were trained"
         )
     if any(key.startswith("backbone.") for key in tensors):
         tensors = from_transformers(tensors)
@@ -160,7 +159,7 @@ def depth_of(
     if dtype not in DTYPES:
         raise ConfigError(f"dtype {dtype}: expected one of {', '.join(sorted(map(str, DTYPES)))}")
     sizes = [network_size(checked_image(image)) for image in images]
-    scales = np.float32(depth_scale) * _focal_factors(images, fx)
+    scales = np.float32(depth_scale) * focal_factors(images, fx)
     if device is not None:
         model.to(checked_device(str(device)))
     found: dict[int, Float32Array] = {}
@@ -205,7 +204,7 @@ def prepared(image: RGBImage, size: Grid) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(normalised.transpose(2, 0, 1), np.float32))
 
 
-def _focal_factors(images: Sequence[RGBImage], fx: Sequence[float] | None) -> Float32Array:
+def focal_factors(images: Sequence[RGBImage], fx: Sequence[float] | None) -> Float32Array:
     """Factor on each image's depth for its focal length in pixels, 1 without one."""
     if fx is None:
         return np.ones(len(images), np.float32)

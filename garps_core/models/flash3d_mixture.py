@@ -127,9 +127,9 @@ def predict_gaussians(
         raise ConfigError(f"dtype {dtype}: expected one of {', '.join(sorted(map(str, DTYPES)))}")
     given = flash3d_input(view)
     device = next(network.parameters()).device
-    picture = torch.from_numpy(given.picture).to(device).permute(2, 0, 1)[None].float() / 255
-    depth = torch.from_numpy(given.depth).to(device)[None, None]
     try:
+        picture = torch.from_numpy(given.picture).to(device).permute(2, 0, 1)[None].float() / 255
+        depth = torch.from_numpy(given.depth).to(device)[None, None]
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             maps = network(picture, depth)
         gaussians = gaussians_of(maps, given.K, given.known, drop_border)

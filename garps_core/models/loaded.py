@@ -11,16 +11,17 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import nn
 
 from garps_core.checks import Float32Array, IntArray
 from garps_core.config import Config
-from garps_core.errors import ReconstructionError, WeightsError
+from garps_core.errors import ModelError, ReconstructionError, WeightsError
 from garps_core.models import mask2former, semantics
-from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of
+from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
 from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
 from garps_core.models.manifest import BY_NAME, named, of_file, range_of
-from garps_core.models.store import default, installed
+from garps_core.models.store import default, installed, weights_folder
 from garps_core.pairing import checked_device
 from garps_core.types import View
 
@@ -28,6 +29,7 @@ AT_THE_END = 0.98
 """Share of the network's largest depth from which on a pixel is as far as the network can say."""
 
 Made = TypeVar("Made")
+Network = TypeVar("Network", bound=nn.Module)
 _LOCK = threading.RLock()
 
 
@@ -39,17 +41,13 @@ def depths(views: Sequence[View], config: Config) -> list[Float32Array]:
         ReconstructionError: most of a picture lies at the end of the network's range.
     """
     settings = config.reconstruction
-    network = depth_network(settings.depth_weights, settings.scene)
-    found = depth_of(
-        network,
-        [view.rgb for view in views],
-        depth_scale=settings.depth_scale,
-        fx=[float(view.K[0, 0]) for view in views] if settings.focal_correction else None,
-        device=config.device,
-        dtype=dtype_of(config),
-    )
-    for view, depth in zip(views, found, strict=True):
-        _check_range(view, depth, network.max_depth * settings.depth_scale)
+    network = on_device(depth_network(settings.depth_weights, settings.scene), config.device)
+    images = [view.rgb for view in views]
+    fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
+    found = depth_of(network, images, depth_scale=settings.depth_scale, fx=fx, dtype=dtype_of(config))
+    largest = network.max_depth * settings.depth_scale * focal_factors(images, fx)
+    for view, depth, largest_m in zip(views, found, largest, strict=True):
+        _check_range(view, depth, float(largest_m))
     return found
 
 
@@ -65,8 +63,9 @@ def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
 def labels(rgb: RGBImage, config: Config) -> IntArray:
     """Class of every pixel, HxW, by the segmentation of the settings. Raises WeightsError, ModelError."""
     settings = config.reconstruction
-    network = segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
-    network.to(checked_device(config.device))
+    network = on_device(
+        segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone), config.device
+    )
     if isinstance(network, mask2former.Mask2Former):
         return mask2former.segment_by_masks(network, rgb)
     return semantics.segment(network, rgb, dtype=dtype_of(config))
@@ -79,13 +78,24 @@ def dtype_of(config: Config) -> torch.dtype:
     )
 
 
+def on_device(network: Network, device: str) -> Network:
+    """The network, moved there. Raises ConfigError for a device that is not there, ModelError where it does not fit."""
+    try:
+        return network.to(checked_device(device))
+    except torch.cuda.OutOfMemoryError as error:
+        raise ModelError(
+            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit; free some, "
+            f"choose a smaller network, or use the CPU ({error})"
+        ) from None
+
+
 def once(load: Callable[..., Made]) -> Callable[..., Made]:
     """Keep the last network that was loaded so; two threads that want it at once load it once."""
-    kept = lru_cache(maxsize=1)(load)
+    kept = lru_cache(maxsize=1)(lambda folder, *given: load(*given))
 
     def under_lock(*given: str) -> Made:
         with _LOCK:
-            return kept(*given)
+            return kept(weights_folder(), *given)  # in another folder "" is another file
 
     return under_lock
 
@@ -105,8 +115,7 @@ def _flash3d(weights: str) -> Flash3D:
 
 def flash3d(weights: str, device: str) -> Flash3D:
     """Flash3D from a name, a file or, for "", what is installed; on the device."""
-    network: Flash3D = _flash3d(weights).to(checked_device(device))
-    return network
+    return on_device(_flash3d(weights), device)
 
 
 @once
@@ -117,7 +126,8 @@ def segmenter(kind: str, weights: str, backbone: str) -> semantics.Segmenter | m
     path, head = _tensors(weights, f"ade20k_{kind}")
     known = of_file(path.name)
     if not backbone and known is not None:
-        backbone = next(one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size)
+        fitting = [one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size]
+        backbone = next(filter(installed, fitting), fitting[0])
     return semantics.segmenter_of(_tensors(backbone, "dinov2")[1].tensors, head.tensors)
 
 

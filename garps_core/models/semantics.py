@@ -178,7 +178,7 @@ def scores_of(
             patches: Tensor = network(given)[0]
     except torch.cuda.OutOfMemoryError as error:
         raise ModelError(
-            f"out of memory on {device} with {size[1]}x{size[0]} pixels: lower short_side ({error})"
+            f"out of memory on {device} with {size[1]}x{size[0]} pixels: choose a smaller backbone or the CPU ({error})"
         ) from None
     if not patches.isfinite().all():
         raise ModelError(f"the network returned NaN or infinity in {dtype}: expected scores; is float32 needed?")
