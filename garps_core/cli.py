@@ -125,14 +125,11 @@ def align(
     \b
     Exit code: 0 = converged, 1 = no pose to be trusted (the reason is printed), 2 = wrong input.
     """
-    files, depths = (source, target), (depth_source, depth_target)
+    files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, start = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     preset = preset or ("default" if splats or any(depths) else "monocular")
     config = _configured(preset, set_ or [], device, reconstruction)
-    of_images = any((*depths, K, K_target))
-    found = (
-        _of_splats(files, config, of_images) if splats else _of_views(_views(files, depths, (K, K_target), depth_scale))
-    )
+    found = _of_splats(files, config, any(depths + Ks)) if splats else _of_views(_views(files, depths, Ks, depth_scale))
     estimate, mixtures = found(config, start)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
     _write_extras(estimate, mixtures, figure, ply)
