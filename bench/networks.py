@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the networks cost on this machine's CPU, and how close they come to its own matrix multiplication.
 
-    python -m bench.networks [--only depth-anything] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
+    python -m bench.networks [--only depth-anything,flash3d] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
 
 Each network runs as GARPS calls it, from images, with random weights (the cost does not depend on them), float32, in a
 fresh process. Every timed call stands between multiplications of large matrices, so that whatever else the machine does
-hits both; numbers are medians. The share by CPU time also bears a machine whose cores are taken by others.
+hits both; numbers are medians. The share by CPU time also bears a machine whose cores are taken by others. A second
+table shows where the time of a whole pair goes (`bench/networks_pair.py`).
 """
 
 from __future__ import annotations
 
 import json
-import resource
 import statistics
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -26,6 +25,7 @@ import typer
 from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
+from bench.networks_pair import pair_lines, peak_mib, seconds_of
 from bench.speed_parts import Check, Row, Section, markdown, print_section
 from bench.tables import machine_facts
 
@@ -65,11 +65,40 @@ def depth_anything(case: Case) -> tuple[Call, str]:
     return lambda: depth_of(model, pictures), f"{rows}x{columns}"
 
 
-MAKERS: Mapping[str, Callable[[Case], tuple[Call, str]]] = {"depth-anything": depth_anything}
+def flash3d(case: Case) -> tuple[Call, str]:
+    """Flash3D on depth that is there, up to the list of Gaussians; one image at a time."""
+    from garps_core.models.flash3d import PADDED, Flash3D, flash3d_network
+    from garps_core.models.flash3d_mixture import predict_gaussians
+    from garps_core.types import View
+
+    network = flash3d_network(Flash3D().state_dict())
+    K = np.array([[case.columns, 0, case.columns / 2], [0, case.columns, case.rows / 2], [0, 0, 1.0]])
+    depth = np.full((case.rows, case.columns), 3, np.float32)
+    views = [View(picture, K, depth) for picture in case.pictures()]
+    return lambda: [predict_gaussians(network, view) for view in views], "x".join(map(str, PADDED))
+
+
+def labels_by_dinov2(case: Case) -> tuple[Call, str]:
+    """DINOv2 with the linear ADE20K head; one image at a time, each as large as it is."""
+    from garps_core.models.semantics import Segmenter, prepared, segment
+
+    network = Segmenter(case.size, last_blocks=1, classes=150).eval().requires_grad_(False)
+    pictures = case.pictures()
+    rows, columns = prepared(pictures[0]).shape[-2:]
+    return lambda: [segment(network, picture) for picture in pictures], f"{rows}x{columns}"
+
+
+MAKERS: Mapping[str, Callable[[Case], tuple[Call, str]]] = {
+    "depth-anything": depth_anything,
+    "flash3d": flash3d,
+    "dinov2-linear": labels_by_dinov2,
+}
 """By name of the network: what makes its call, and tells the size that its input has. Add a network here."""
 CASES = (
     *(Case("depth-anything", size, 1, 518, 518) for size in ("vits", "vitb", "vitl")),
     *(Case("depth-anything", size, 2, 480, 640, bar=BAR_SHARE) for size in ("vits", "vitb", "vitl")),
+    Case("flash3d", "", 1, 480, 640),
+    Case("dinov2-linear", "vits", 1, 480, 640),
 )
 """And its lines here; a network of one size only has size "" and is always among those measured."""
 
@@ -86,10 +115,10 @@ def chosen(only: str, sizes: str) -> list[Case]:
 def measured(case: Case, runs: int, threads: int) -> Row:
     """One line of the table; for a process of its own, whose peak memory counts."""
     torch.set_num_threads(threads)
-    imported = _peak_mib()
+    imported = peak_mib()
     call, inside = MAKERS[case.network](case)
     call()  # warms up
-    peak = _peak_mib()  # counting keeps intermediate results and would add to it
+    peak = peak_mib()  # counting keeps intermediate results and would add to it
     flop = counted_flop(call)
     rounds = [_round(call, flop) for _ in range(runs)]
     told = {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
@@ -118,7 +147,7 @@ def _round(call: Call, flop: int) -> dict[str, float]:
         for _ in range(MULTIPLICATIONS):
             torch.mm(matrices[0], matrices[1], out=matrices[2])
 
-    before, own, after = (_seconds(action) for action in (multiply, call, multiply))
+    before, own, after = (seconds_of(action) for action in (multiply, call, multiply))
     product_flop = 2 * 2 * MULTIPLICATIONS * MATRIX**3
     wall_rate, cpu_rate = (product_flop / (before[i] + after[i]) for i in (0, 1))
     return {
@@ -129,17 +158,6 @@ def _round(call: Call, flop: int) -> dict[str, float]:
         "share": flop / own[0] / wall_rate,
         "share by CPU time": flop / own[1] / cpu_rate,
     }
-
-
-def _seconds(action: Call) -> tuple[float, float]:
-    """Wall and CPU seconds, the latter of all threads."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    action()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def lines(cases: list[Case], runs: int, threads: int) -> Iterator[Row]:
@@ -154,6 +172,7 @@ def main(
     sizes: Annotated[str, typer.Option(help="some of vits, vitb, vitl, where a network has sizes")] = "vits",
     runs: Annotated[int, typer.Option(min=1, help="timed calls of each")] = 5,
     threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    pairs: Annotated[bool, typer.Option(help="also the stages of a whole pair")] = True,
     out: Annotated[Path, typer.Option(help="where the results go")] = Path("out/networks"),
 ) -> None:
     """CPU seconds, peak memory and throughput of the networks, and their share of what matrices reach here."""
@@ -166,11 +185,16 @@ def main(
         rows.append(row)
         checks += [Check(what, row["share"], case.bar, at_least=True)] if case.bar is not None else []
         console.print(f"{row['network']}, {row['images']}: {row['wall s']:.2f} s", markup=False)
-    section = Section(f"Networks, float32, {threads} threads, medians of {runs}", checks, rows)
-    print_section(console, section)
+    title = f"float32, {threads} threads, medians of {runs}"
+    sections = {"networks": Section(f"Networks, {title}", checks, rows)}
+    if pairs:
+        sections["pairs"] = Section(f"A pair of 640x480 without depth, {title}", [], pair_lines(runs, threads))
+    for section in sections.values():
+        print_section(console, section)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "run.json").write_text(json.dumps({"facts": told, "networks": section.as_json()}, indent=1))
-    (out / "table.md").write_text(markdown({"networks": section}, told))
+    found = {name: section.as_json() for name, section in sections.items()}
+    (out / "run.json").write_text(json.dumps({"facts": told} | found, indent=1))
+    (out / "table.md").write_text(markdown(sections, told))
 
 
 if __name__ == "__main__":

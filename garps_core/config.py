@@ -178,7 +178,7 @@ def _monocular() -> Config:
             ladder=ladder,
             search_ladder=Alignment().search_ladder[:2] + ladder[1:],
             depth_errors=True,
-            brightness=0.05,
+            brightness=0.04,
             information=5.0,
         ),
     )

@@ -58,11 +58,12 @@ def _mutual(
     if len(a) < 2 or len(b) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     similarity = a @ b.T  # unit vectors: squared distance = 2 - 2 similarity
-    best_two = np.partition(similarity, -2, axis=1)[:, -2:]
-    forward, backward = similarity.argmax(1), similarity.argmax(0)
-    rows = np.arange(len(a))
-    distinct = (1 - best_two[:, 1]) < ratio**2 * (1 - best_two[:, 0])
-    keep = rows[(backward[forward] == rows) & distinct]
+    rows, forward, best_of_target = np.arange(len(a)), similarity.argmax(1), similarity.max(0)
+    best = similarity[rows, forward]
+    similarity[rows, forward] = -np.inf
+    second = similarity.max(1)  # twice the largest is much faster than a partition
+    distinct = (1 - best) < ratio**2 * (1 - second)
+    keep = rows[(best >= best_of_target[forward]) & distinct]
     pairs = np.unique(np.stack([keep, forward[keep]], axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
 

@@ -37,10 +37,13 @@ class Cloud:
 
     def take(self, index: Tensor) -> Cloud:
         """Components `index` (bool mask or integers)."""
+        if index.dtype == torch.bool:
+            index = index.nonzero().squeeze(1)  # once, not for every part
         labels = None if self.labels is None else self.labels[index]
-        return Cloud(
-            self.means[index], self.covariances[index], self.weights[index], self.colours[index], labels, self.frustum
+        means, covariances, weights, colours = (
+            part.index_select(0, index) for part in (self.means, self.covariances, self.weights, self.colours)
         )
+        return Cloud(means, covariances, weights, colours, labels, self.frustum)
 
 
 def checked_device(name: str) -> torch.device:

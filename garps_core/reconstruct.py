@@ -48,7 +48,7 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     needing = [i for i, view in enumerate(views) if view.depth is None or method == "depth_anything_v2"]
     if not needing or method == "rgbd":
         return list(views)
-    _check_settings(config)
+    check_settings(config)
     from garps_core.models import loaded  # networks cost nothing where none is used
 
     try:
@@ -94,7 +94,8 @@ def mixtures_of(views: Sequence[View], config: Config) -> list[Mixture]:
         return list(pool.map(mixture_of, views, [config] * len(views)))
 
 
-def _check_settings(config: Config) -> None:
+def check_settings(config: Config) -> None:
+    """Raises ConfigError where depth from a network meets settings for a sensor's; for auto it is a view's fault."""
     if config.alignment.depth_errors or config.alignment.solver == "adam":
         return
     if config.reconstruction.method == "auto":

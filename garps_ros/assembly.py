@@ -20,7 +20,7 @@ class Assembly:
     """Takes messages in any order of topics, in order of time within each.
 
     Args:
-        cameras: [source, target], or [source] alone.
+        cameras: [source, target], or [source] alone; one without a depth topic gives frames without depth.
         slop_ns: largest difference of stamps that belong together, ns.
         refused: called with topic and reason for every message that cannot be used.
         live: see `Pairer`.
@@ -53,6 +53,8 @@ class Assembly:
         pairs = self._with_depth[index].add(role, stamp_ns, message)
         if pairs is None:
             self._refused(topic, f"header.stamp {stamp_ns} ns is not later than the one before: expected it to grow")
+        elif not camera.depth:  # then nothing belongs to the image, at the same time
+            pairs = self._with_depth[index].add(DEPTH, stamp_ns, None)
         return self._all_framed(index, pairs or [])
 
     def settle(self) -> Complete:
@@ -94,7 +96,7 @@ class Assembly:
         return {
             f"{a} and {b}": (pairer.latest[0] - pairer.latest[1]) * 1e-9
             for (a, b), pairer in zip(names, self._pairers, strict=False)
-            if min(pairer.latest) > 0
+            if b and min(pairer.latest) > 0
         }
 
     @property

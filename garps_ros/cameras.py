@@ -9,14 +9,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of one camera; empty = not known yet."""
+    """The topics of one camera; empty = not known yet, or a depth that a network gives."""
 
     image: str = ""
     info: str = ""
     depth: str = ""
 
     def __str__(self) -> str:
-        return f"image {self.image}, info {self.info}, depth {self.depth}"
+        return f"image {self.image}, info {self.info}, depth {self.depth or 'from a network'}"
 
 
 @dataclass(frozen=True)
@@ -27,4 +27,5 @@ class Frame:
     stamp_ns: int
     image: Any
     depth: Any
+    """None where a network gives it."""
     info: Any

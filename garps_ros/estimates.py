@@ -22,6 +22,9 @@ FAILURES: dict[type[Exception], str] = {
 }
 OTHER_FAILURE = "core_error"
 
+Completed = Callable[[View], View]
+"""Gives a view the depth that its estimates are made from."""
+
 
 @dataclass(frozen=True, eq=False)
 class Row:
@@ -133,19 +136,24 @@ def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Es
 
 
 def estimate_keyframes(
-    frames: Iterable[Frame], reader: ViewReader, tracker: KeyframeTracker
+    frames: Iterable[Frame], reader: ViewReader, tracker: KeyframeTracker, completed: Completed = lambda view: view
 ) -> Iterator[Origin | Outcome]:
     """One camera: its pose in the first keyframe of the segment; rows hold the pose in the keyframe that was used."""
     for frame in frames:
-        yield from follow_frame(frame, reader, tracker)
+        yield from follow_frame(frame, reader, tracker, completed)
 
 
-def follow_frame(frame: Frame, reader: ViewReader, tracker: KeyframeTracker) -> Iterator[Origin | Outcome]:
-    """One more frame of the camera: an Origin where a segment begins, else every attempt at a pose."""
+def follow_frame(
+    frame: Frame, reader: ViewReader, tracker: KeyframeTracker, completed: Completed = lambda view: view
+) -> Iterator[Origin | Outcome]:
+    """One more frame of the camera: an Origin where a segment begins, else every attempt at a pose.
+
+    A view is `completed` once, however many estimates it takes part in.
+    """
     began = time.perf_counter()
     name = frame_name(frame)
     try:
-        view = reader.read(frame)
+        view = completed(reader.read(frame))
         if tracker.begins(view):
             yield Origin(tracker.segment, _start_name(name, tracker), name, view.stamp_ns)
             return

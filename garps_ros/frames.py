@@ -47,7 +47,8 @@ class Frames:
         roles: dict[str, list[tuple[int, int]]] = {}
         for index, camera in enumerate(self._cameras):
             for topic, role in ((camera.image, IMAGE), (camera.depth, DEPTH), (camera.info, INFO)):
-                roles.setdefault(topic, []).append((index, role))
+                if topic:
+                    roles.setdefault(topic, []).append((index, role))
             # Calibration that is recorded after the first image is still that image's calibration.
             if (info := self._bag.first(camera.info)) is not None:
                 self._assembly.add_info(index, info)

@@ -17,6 +17,7 @@ from garps_ros.arrivals import MANY_MISSING, Arrivals
 
 WINDOW = 200
 """Results that latencies look back on."""
+WITHOUT_DEPTH = "reconstruction.method:=depth_anything_v2 with preset:=monocular does without depth"
 
 
 class Level(enum.IntEnum):
@@ -224,6 +225,8 @@ def _troubles(states: list[InputState], now_s: float, timeout_s: float) -> list[
             silent.append(f"{where} for {age:.1f} s")
     if never:
         troubles.append(f"nothing received yet: {', '.join(never)}")
+        if all("/depth (" in where for where in never):
+            troubles[-1] += f" ({WITHOUT_DEPTH})"
     if silent:
         troubles.append(f"silent: {', '.join(silent)}")
     return troubles

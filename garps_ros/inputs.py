@@ -37,20 +37,18 @@ class Takers:
     say: Callable[[str, str], None]
 
 
-def camera_topics(node: Node, settings: NodeSettings) -> list[CameraTopics]:
+def camera_topics(node: Node, settings: NodeSettings, depth: bool) -> list[CameraTopics]:
     """The topics as remapped, by which calibrations are chosen and errors are named; one camera with a keyframe."""
-    parts = ("image", "camera_info", "depth")
+    parts = ("image", "camera_info", *(["depth"] if depth else []))
     return [CameraTopics(*(node.resolve_topic_name(f"{side}/{part}") for part in parts)) for side in _sides(settings)]
 
 
-def subscribe(node: Node, settings: NodeSettings, takers: Takers) -> list[Input]:
-    """Subscribe to everything that the settings ask for."""
+def subscribe(node: Node, settings: NodeSettings, depth: bool, takers: Takers) -> list[Input]:
+    """Subscribe to everything that the settings ask for, to depth where that is wanted."""
     inputs = []
     for index, side in enumerate(_sides(settings)):
-        for part, role, transport in (
-            ("image", IMAGE, settings.image_transport),
-            ("depth", DEPTH, settings.depth_transport),
-        ):
+        images = [("image", IMAGE, settings.image_transport), ("depth", DEPTH, settings.depth_transport)]
+        for part, role, transport in images if depth else images[:1]:
             name = f"{side}/{part}"
             kind, topic = _transported(node, name, transport)
             taker = partial(takers.image, index, role)

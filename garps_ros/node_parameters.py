@@ -21,11 +21,12 @@ from garps_core.config import Config
 from garps_core.errors import ConfigError
 from garps_core.pairing import checked_device
 from garps_ros.parameters import Parameter, no_such_parameter, parameters, settings_from
+from garps_ros.preparation import check_method
 from garps_ros.settings import NodeSettings
 
 Type = rclpy.parameter.Parameter.Type
 TYPES = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}
-OUR_PREFIXES = ("lifting.", "start.", "alignment.")
+OUR_PREFIXES = ("reconstruction.", "lifting.", "start.", "alignment.")
 ALIKE = 0.83  # names at least this similar to one of ours are taken for a typo; `max_range` (0.82) is not
 
 
@@ -50,6 +51,7 @@ class NodeParameters:
         self._values = {parameter.name: _start_value(parameter, overrides) for parameter in declared}
         self.node, self.config = settings_from(self._values)
         checked_device(self.config.device)
+        check_method(self.config)
         node.declare_parameters(
             "", [(parameter.name, parameter.default, describe(parameter)) for parameter in declared]
         )
@@ -64,7 +66,7 @@ class NodeParameters:
         ours = self._ours(changes)
         try:
             if ours:
-                settings_from(self._values | ours)
+                check_method(settings_from(self._values | ours)[1])
             if "device" in ours:
                 checked_device(ours["device"])
         except ConfigError as error:

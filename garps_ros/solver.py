@@ -14,18 +14,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.align import estimate_relative_pose
+from garps_core.align import estimate_with_mixtures
 from garps_core.checks import Float64Array
 from garps_core.config import Config
 from garps_core.geometry import se3_inverse
-from garps_core.reconstruct import reconstruct
-from garps_core.types import PoseEstimate, Prior, View
+from garps_core.reconstruct import with_depth
+from garps_core.types import Mixture, PoseEstimate, Prior, View
 from garps_ros.cameras import Frame
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_pair, failed_outcome, follow_frame, frame_names
+from garps_ros.preparation import load_networks, scale_from, settings_of_completed, warm_up
 from garps_ros.priors import prior_from_message
 from garps_ros.settings import NodeSettings
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
 from msg_adapters import MessageError, header_frame_id
+
+IN_CORE = ("depth", "estimate")
+"""Stages whose time is the core's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +73,7 @@ class Result:
     began_s: float = 0.0
     """Steady time at which the computation began."""
     core_s: float = 0.0
-    """Time inside `estimate_relative_pose`, all attempts together, s."""
+    """Time inside the estimator, all attempts together, and a network's for depth, s."""
     prior: str = "none"
     """What became of the prior: none, used, or why not."""
     doubts: list[str] = field(default_factory=list)
@@ -97,13 +101,23 @@ class Solver:
         self._job: Job
         self._result: Result
         self._prior: Prior | None = None
-        self._seen: tuple[View, View, PoseEstimate] | None = None
+        self._aligned: tuple[PoseEstimate, tuple[Mixture, Mixture] | None] | None = None
         self.stage = ""
         """What the thread does at present; "" between jobs."""
+        self.scale = ""
+        """Where metres come from, for people; known once prepared."""
+
+    def prepare(self, config: Config) -> None:
+        """Do what the first job would wait for. Raises what `load_networks` does."""
+        with self._in_stage("load networks"):
+            load_networks(config, self._say)
+            self.scale = scale_from(config)
+        with self._in_stage("compile"):
+            warm_up(config, self._say)
 
     def __call__(self, job: Job) -> Result:
         """Compute a job. An error that nobody expected becomes an outcome with status core_error, and its trace."""
-        self._job, self._result, self._seen, self._prior = job, Result(job, began_s=time.monotonic()), None, None
+        self._job, self._result, self._aligned, self._prior = job, Result(job, began_s=time.monotonic()), None, None
         self._reader.rectified, self._reader.allow_resized = job.settings.rectified, job.settings.allow_resized
         result = self._result
         with self._in_stage("decode"):
@@ -124,7 +138,7 @@ class Solver:
             self._read_prior()
             yield estimate_pair(frames[0], frames[1], self._reader, self._estimate)
             return
-        yield from follow_frame(frames[0], self._reader, self._followed())
+        yield from follow_frame(frames[0], self._reader, self._followed(), self._completed)
         self._result.keyframes = self._followed().keyframes
 
     def _followed(self) -> KeyframeTracker:
@@ -161,14 +175,19 @@ class Solver:
             doubts.append(f"{what}; set source_frame and target_frame")
         return doubts
 
+    def _completed(self, view: View) -> View:
+        with self._in_stage("depth"):
+            return with_depth([view], self._job.config)[0]
+
     def _estimate(self, source: View, target: View) -> PoseEstimate:
-        began = time.perf_counter()
+        config = self._job.config
+        if len(self._job.frames) == 1:
+            config = settings_of_completed(config)
         with self._in_stage("estimate"):
-            found = estimate_relative_pose(source, target, self._job.config, self._prior)
-        self._result.core_s += time.perf_counter() - began
+            found, mixtures = estimate_with_mixtures(source, target, config, self._prior)
         if self._prior is not None:
             self._result.prior = self._use_of_prior(found)
-        self._seen = source, target, found
+        self._aligned = found, mixtures if self._job.clouds else None
         return found
 
     def _use_of_prior(self, found: PoseEstimate) -> str:
@@ -191,24 +210,26 @@ class Solver:
 
     def _clouds(self, outcome: Origin | Outcome) -> tuple[Cloud, Cloud] | None:
         """Both clouds in the frame of the outcome; with a keyframe that is not the keyframe's own."""
-        if isinstance(outcome, Origin) or outcome.T is None or self._seen is None:
+        if isinstance(outcome, Origin) or outcome.T is None or self._aligned is None:
             return None
-        source, target, found = self._seen
-        if found.T_target_source is None:
+        found, mixtures = self._aligned
+        if found.T_target_source is None or mixtures is None:
             return None
         with self._in_stage("clouds"):
             T_frame_target = outcome.T @ se3_inverse(found.T_target_source)
-            return self._cloud(source, outcome.T), self._cloud(target, T_frame_target)
-
-    def _cloud(self, view: View, T: Float64Array) -> Cloud:
-        mixture = reconstruct(view, self._job.config)
-        points = mixture.means @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
-        return Cloud(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))
+            return _cloud(mixtures[0], outcome.T), _cloud(mixtures[1], T_frame_target)
 
     @contextmanager
     def _in_stage(self, name: str) -> Iterator[None]:
-        before, self.stage = self.stage, name
+        before, self.stage, began = self.stage, name, time.perf_counter()
         try:
             yield
         finally:
             self.stage = before
+            if name in IN_CORE:
+                self._result.core_s += time.perf_counter() - began
+
+
+def _cloud(mixture: Mixture, T: Float64Array) -> Cloud:
+    points = mixture.means @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+    return Cloud(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))

@@ -20,11 +20,14 @@ class Worker(Generic[Job, Result]):
     Args:
         compute: from a job to its result; runs in the thread. Expected failures are results, not exceptions: one
             that escapes ends the thread, which `death` then says; `restart` begins a new one.
-        finished: called in the thread when a result is ready to be taken; must not raise.
+        finished: called in the thread when a result is ready to be taken, or when prepared; must not raise.
+        prepare: called in the thread before the first job, once, whatever comes of it.
     """
 
-    def __init__(self, compute: Callable[[Job], Result], finished: Callable[[], None]) -> None:
-        self._compute, self._finished = compute, finished
+    def __init__(
+        self, compute: Callable[[Job], Result], finished: Callable[[], None], prepare: Callable[[], None] | None = None
+    ) -> None:
+        self._compute, self._finished, self._prepare = compute, finished, prepare
         self._changed = threading.Condition()
         self._waiting: Job | None = None
         self._stopped = False
@@ -34,6 +37,10 @@ class Worker(Generic[Job, Result]):
         """Jobs begin at least this far apart, s; a change counts from the next offer on."""
         self.death = ""
         """Why the thread ended although nobody stopped it; empty while it lives."""
+        self.error: BaseException | None = None
+        """What it ended by."""
+        self.prepared = False
+        """The thread takes jobs."""
         self._begin()
 
     def offer(self, job: Job) -> bool:
@@ -64,7 +71,7 @@ class Worker(Generic[Job, Result]):
 
     def restart(self) -> None:
         """A new thread after `death`."""
-        self.death, self._busy_since = "", None
+        self.death, self.error, self._busy_since = "", None, None
         self._begin()
 
     def stop(self, timeout_s: float) -> bool:
@@ -83,13 +90,22 @@ class Worker(Generic[Job, Result]):
     def _run(self) -> None:
         begun_s = -math.inf
         try:
+            self._get_ready()
             while (job := self._next(begun_s)) is not None:
                 self._busy_since = begun_s = time.monotonic()
                 self._results.append(self._compute(job))
                 self._busy_since = None
                 self._tell()
         except BaseException as error:  # also SystemExit: whoever watches must know
-            self.death = f"{type(error).__name__}: {error}"
+            self.error, self.death = error, f"{type(error).__name__}: {error}"
+            self._tell()
+
+    def _get_ready(self) -> None:
+        prepare, self._prepare = self._prepare, None
+        if prepare is not None:
+            prepare()
+        if not self.prepared:
+            self.prepared = True
             self._tell()
 
     def _tell(self) -> None:
