@@ -38,11 +38,14 @@ class Reconstruction(Checked):
         "auto",
         "rgbd = the sensor's depth; a network; ply = mixtures from files; auto = depth_anything_v2 without a sensor",
         choices=METHODS,
+        live=False,
     )
-    depth_weights: str = setting("", "of the depth network: a name or a file; empty = the first that is installed")
-    flash3d_weights: str = setting("", "of Flash3D, likewise")
+    depth_weights: str = setting(
+        "", "of the depth network: a name or a file; empty = the first that is installed", live=False
+    )
+    flash3d_weights: str = setting("", "of Flash3D, likewise", live=False)
     scene: str = setting(
-        "any", "what depth_weights must be made for; told here where the file does not", choices=SCENES
+        "any", "what depth_weights must be made for; told here where the file does not", choices=SCENES, live=False
     )
     depth_scale: float = setting(1.0, "factor on the network's depth", unit="", low=1e-3, high=1e3)
     focal_correction: bool = setting(
@@ -53,9 +56,12 @@ class Reconstruction(Checked):
         "none",
         "labels by DINOv2 (linear, ms) or Mask2Former; none = `alignment.semantic_discount` has no effect",
         choices=("none", "linear", "ms", "m2f"),
+        live=False,
     )
-    semantic_weights: str = setting("", "of the head, or of all of m2f: a name or a file; empty = the first installed")
-    semantic_backbone: str = setting("", "weights of DINOv2 for linear and ms, likewise")
+    semantic_weights: str = setting(
+        "", "of the head, or of all of m2f: a name or a file; empty = the first installed", live=False
+    )
+    semantic_backbone: str = setting("", "weights of DINOv2 for linear and ms, likewise", live=False)
     network_dtype: str = setting(
         "float32", "what networks compute in; the other two for GPUs", choices=("float32", "float16", "bfloat16")
     )

@@ -16,6 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
+from garps_core.errors import GarpsError
 from garps_ros.cameras import Frame
 from garps_ros.estimates import Origin, Outcome
 from garps_ros.health import Health, memory
@@ -23,8 +24,10 @@ from garps_ros.inputs import Takers, camera_topics, subscribe
 from garps_ros.intake import Intake
 from garps_ros.log import Log
 from garps_ros.node_parameters import NodeParameters
+from garps_ros.preparation import needs_depth
 from garps_ros.priors import Priors
 from garps_ros.publishing import Publishing
+from garps_ros.remarks import note_outcome, note_result
 from garps_ros.solver import Job, Result, Solver
 from garps_ros.worker import Worker
 from msg_adapters import NANOSECONDS, MessageError
@@ -35,7 +38,9 @@ BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), o
 
 
 class PoseNode:
-    """Subscribes to one or two RGB-D cameras and publishes the pose of the source camera in the target camera.
+    """Subscribes to one or two cameras and publishes the pose of the source camera in the target camera.
+
+    It is ready once its worker has loaded and compiled what the first pair needs.
 
     Args:
         node: the rclpy node that it gives its interfaces to.
@@ -45,19 +50,22 @@ class PoseNode:
     """
 
     def __init__(self, node: Node) -> None:
-        self._node, self._log = node, Log(node.get_logger())
+        self.refusal = ""
+        """Why it cannot become ready; whoever runs it then ends it."""
+        self._node, self._log, self._is_ready = node, Log(node.get_logger()), False
         self._health, self._priors = Health(), Priors()
         self._enabled, self._epoch, self._generation = True, 0, 0
         self._parameters = NodeParameters(node, self._settings_changed)
         self._decisive = self._what_decides()
         self._publishing = Publishing(node, self._parameters.node.publish_tf, self._log)
-        cameras = camera_topics(node, self._parameters.node)
+        depth = needs_depth(self._parameters.config)
+        cameras = camera_topics(node, self._parameters.node, depth)
         self._intake = Intake(cameras, self._slop_ns, self._refused, self._forget)
         takers = Takers(self._image, self._info, self._prior, self._log.warn)
-        self._inputs = subscribe(node, self._parameters.node, takers)
-        self._ready = node.create_guard_condition(self._deliver)
+        self._inputs = subscribe(node, self._parameters.node, depth, takers)
+        self._news = node.create_guard_condition(self._deliver)
         self._solver = Solver(self._log.info)
-        self._worker: Worker[Job, Result] = Worker(self._solver, self._ready.trigger)
+        self._worker: Worker[Job, Result] = Worker(self._solver, self._news.trigger, self._prepare)
         self._apply_settings()
         node.create_service(Trigger, "~/reset", self._reset)
         node.create_service(SetBool, "~/enable", self._enable)
@@ -66,7 +74,6 @@ class PoseNode:
         node.create_timer(1.0, self._every_second, clock=steady)
         # The handle is kept: without it rclpy calls into freed memory when the clock jumps.
         self._jump_handle = node.get_clock().create_jump_callback(BACKWARDS, post_callback=self._clock_jumped)
-        self._say_ready()
 
     def stop(self, timeout_s: float) -> bool:
         """End the worker; False when its computation outlasts the timeout."""
@@ -130,26 +137,15 @@ class PoseNode:
 
     def _deliver(self) -> None:
         """Publish what the worker has finished."""
+        if self._worker.prepared and not self._is_ready:
+            self._is_ready = True
+            self._say_ready()
         for result in self._worker.take():
             if result.job.generation != self._generation:
                 self._health.dropped[STALE] += 1
                 continue
-            self._report(result)
+            note_result(result, self._health, self._log)
             self._publish(result)
-
-    def _report(self, result: Result) -> None:
-        """What a result says besides its poses."""
-        facts = self._health.facts
-        facts["prior"] = result.prior
-        facts["doubts"] = "; ".join(result.doubts)
-        if result.keyframes:
-            facts["keyframes"] = str(result.keyframes)
-        if result.prior not in ("none", "used"):
-            self._log.warn("prior", f"prior {result.prior}")
-        for doubt in result.doubts:
-            self._log.warn(f"doubt {doubt}", doubt)
-        if result.trace:
-            self._log.error("estimate", f"unexpected error: {result.trace}")
 
     def _publish(self, result: Result) -> None:
         """The pose of a result, if any attempt has one; else why the last has none."""
@@ -160,10 +156,7 @@ class PoseNode:
         if not attempts:
             return
         outcome = next((attempt for attempt in attempts if attempt.T is not None), attempts[-1])
-        self._health.facts["frames"] = f"{outcome.child_frame_id} in {outcome.frame_id}"
-        if outcome.row.overlap is not None:
-            self._health.facts["overlap"] = f"{outcome.row.overlap:.2f}"
-            self._health.facts["quality"] = f"{outcome.row.quality or 0:.2f}"
+        note_outcome(outcome, self._health)
         if outcome.T is None or outcome.covariance is None:
             self._reject(outcome.row.status, outcome.row.reason)
             return
@@ -190,7 +183,7 @@ class PoseNode:
     def _settings_changed(self) -> None:
         """Results of other settings are dropped, where those had a say; a keyframe read otherwise is forgotten."""
         before, self._decisive = self._decisive, self._what_decides()
-        if before[:2] != self._decisive[:2]:
+        if before[:3] != self._decisive[:3]:
             self._epoch += 1
         if before != self._decisive:
             self._generation += 1
@@ -198,9 +191,10 @@ class PoseNode:
         self._apply_settings()
 
     def _what_decides(self) -> tuple[Any, ...]:
-        """The settings that a result depends on; the first two are about reading images."""
+        """The settings that a result depends on; the first three are about reading images."""
         s = self._parameters.node
-        return s.rectified, s.allow_resized, s.source_frame, s.target_frame, self._parameters.config
+        config = self._parameters.config
+        return s.rectified, s.allow_resized, config.reconstruction, s.source_frame, s.target_frame, config
 
     def _apply_settings(self) -> None:
         self._intake.slop_ns = self._slop_ns
@@ -266,7 +260,10 @@ class PoseNode:
                 self._log.warn(f"finding {finding.name}", f"{finding.name}: {finding.message}")
 
     def _revive(self) -> None:
-        if not self._worker.death:
+        if not self._worker.death or self.refusal:
+            return
+        if isinstance(self._worker.error, GarpsError):  # none leaves a job: it is of what was to be loaded
+            self.refusal = str(self._worker.error)
             return
         self._health.fail("worker", f"ended by {self._worker.death}; restarted")
         self._log.error("worker", f"worker ended by {self._worker.death}: restarted")
@@ -283,8 +280,11 @@ class PoseNode:
         return memory(self._parameters.config.device) | {
             "enabled": str(self._enabled),
             "unpaired messages": str(self._intake.unpaired),
-            "scale from": "the depth topics, m",
+            "scale from": self._solver.scale,
         }
+
+    def _prepare(self) -> None:
+        self._solver.prepare(self._parameters.config)
 
     # --- what it says -----------------------------------------------------------------------------------------------
 

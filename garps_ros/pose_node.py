@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 run garps_ros pose_node`: starts the node, and ends it in good order on SIGINT and SIGTERM.
 
-Exit code 0 = asked to stop, 1 = stalled (see STALL_S), 2 = wrong parameters or no rclpy; 128 + n on a second signal.
+Exit code 0 = asked to stop, 1 = stalled (see STALL_S), 2 = wrong parameters, weights that are missing, or no rclpy;
+128 + n on a second signal.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ def _is_users(error: Exception) -> bool:
 
 def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
     watched_s = -STALL_S
-    while not stopped:
+    while not (stopped or node.refusal):
         if time.monotonic() - watched_s > 1.0:
             watched_s = time.monotonic()
             faulthandler.dump_traceback_later(STALL_S, exit=True)
@@ -118,13 +119,14 @@ def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
         except Exception as error:
             node.failed(error, traceback.format_exc())
     faulthandler.dump_traceback_later(STALL_S, exit=True)
+    code = _refuse(node.refusal) if node.refusal and not stopped else 0
     if not node.stop(PATIENCE_S):  # it goes on in native code; the interpreter cannot be taken down under it
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(0)
+        os._exit(code)
     executor.shutdown()
     ros.destroy_node()
-    return 0
+    return code
 
 
 def _stop_on_signals() -> list[int]:

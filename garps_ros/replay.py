@@ -17,8 +17,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from garps_core.align import estimate_relative_pose
-from garps_core.config import PRESETS, Config
-from garps_core.errors import ConfigError
+from garps_core.config import METHODS, PRESETS, Config
+from garps_core.errors import GarpsError
+from garps_core.reconstruct import with_depth
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
@@ -26,6 +27,7 @@ from garps_ros.cameras import CameraTopics
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.frames import Frames
 from garps_ros.outputs import Outputs
+from garps_ros.preparation import check_method, load_networks, needs_depth, settings_of_completed
 from garps_ros.session import record, stop_on_signals
 from garps_ros.summary import Summary
 from garps_ros.topics import choose_cameras
@@ -51,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = app(args=arguments, prog_name=NAME, standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except (BagError, ConfigError) as error:
+    except (BagError, GarpsError) as error:
         message = str(error)
     except ClickException as error:
         message = error.format_message()  # type: ignore[attr-defined]
@@ -69,7 +71,8 @@ HELP = """Metric relative poses from a recording, offline and without ROS.
 
 Two cameras: the pose of the source camera in the target camera's frame, for every pair of images taken together.
 One camera: its path in the frame of its first image. Topics that are not given are guessed and printed.
-Every camera needs depth registered to its image.
+Every camera needs depth registered to its image; or --reconstruction names a network that does without (see
+`garps weights`).
 
 \b
 Writes into --out:
@@ -84,6 +87,7 @@ Examples:
   garps-replay walk/ --out walk_poses
   garps-replay rig.mcap --source-image /right/image_raw --target-image /left/image_raw
   garps-replay old.bag --pairing keyframe --set lifting.stride=4 --limit 20
+  garps-replay rgb.mcap --reconstruction depth_anything_v2
   garps-replay walk/ --to-ros --rate 0.5 --loop
   garps-replay rig.mcap --to-ros --topics /left/image_raw --topics /left/camera_info --wait 0
 \b
@@ -133,7 +137,12 @@ def replay(
         int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
     ] = 5,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
-    preset: Annotated[str, typer.Option(help=f"Settings: {', '.join(PRESETS)}.")] = "default",
+    preset: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(PRESETS)}.  [default: default; of a network monocular]")
+    ] = None,
+    reconstruction: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(METHODS[:-1])}.  [default: auto, the depth topics]")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
@@ -149,14 +158,27 @@ def replay(
         return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
     _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
-    config = changed_config(Config.preset(preset), set_ or [])
+    config = _configured(preset, reconstruction, set_ or [])
     rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after)
     source = CameraTopics(source_image, source_info, source_depth)
     target = CameraTopics(target_image, target_info, target_depth)
+    if not needs_depth(config) and (source_depth or target_depth):
+        method = config.reconstruction.method
+        raise BagError(f"a depth topic is given, and {method} does without: expected one of both")
     with Bag(bag) as recording:
-        cameras = choose_cameras(recording, source, target, pairing)
+        cameras = choose_cameras(recording, source, target, pairing, needs_depth(config))
+        load_networks(config, lambda text: print(text, file=sys.stderr))
         with Outputs(out, overwrite) as outputs:
             return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
+
+
+def _configured(preset: str | None, method: str | None, changes: list[str]) -> Config:
+    """The settings; of a network from the preset for its depth, where none is given."""
+    changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
+    with_sensor = needs_depth(changed_config(Config(), changes))
+    config = changed_config(Config.preset(preset or ("default" if with_sensor else "monocular")), changes)
+    check_method(config)
+    return config
 
 
 def _check_given(context: typer.Context, to_ros: bool) -> None:
@@ -210,12 +232,17 @@ def _run(
 def _outcomes(
     frames: Frames, reader: ViewReader, config: Config, rule: KeyframeRule, cameras: int
 ) -> Iterator[Origin | Outcome]:
+    used = config if cameras == 2 else settings_of_completed(config)
+
     def estimate(source: View, target: View) -> PoseEstimate:
-        return estimate_relative_pose(source, target, config)
+        return estimate_relative_pose(source, target, used)
+
+    def completed(view: View) -> View:
+        return with_depth([view], config)[0]
 
     if cameras == 2:
         return estimate_pairs(frames.pairs(), reader, estimate)
-    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule))
+    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule), completed)
 
 
 def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:

@@ -15,7 +15,15 @@ TRANSPORTS = ("compressed", "compressedDepth")
 REGISTERED = ("aligned", "registered", "depth_to_rgb", "depth_to_color")
 
 
-def choose_cameras(bag: Bag, source: CameraTopics, target: CameraTopics, pairing: str) -> list[CameraTopics]:
+WITHOUT_DEPTH = (
+    "or let a network do without: --reconstruction depth_anything_v2, whose weights "
+    "`garps weights fetch depth-anything-v2-indoor-small` installs"
+)
+
+
+def choose_cameras(
+    bag: Bag, source: CameraTopics, target: CameraTopics, pairing: str, depth: bool = True
+) -> list[CameraTopics]:
     """The cameras to use: [source, target], or [source] when one camera is followed against its keyframes.
 
     Args:
@@ -23,6 +31,7 @@ def choose_cameras(bag: Bag, source: CameraTopics, target: CameraTopics, pairing
         source: topics that were asked for; empty ones are guessed.
         target: likewise, of the second camera.
         pairing: "cameras", "keyframe" or "auto" (two cameras when there are two).
+        depth: every camera needs a depth topic; else none is used.
     Raises:
         BagError: a topic that is missing or of another type, no depth, or no one guess; lists what is there.
     """
@@ -30,12 +39,12 @@ def choose_cameras(bag: Bag, source: CameraTopics, target: CameraTopics, pairing
     if pairing == "keyframe" and target != CameraTopics():
         raise BagError("--pairing keyframe follows one camera: expected --source-... topics only")
     if pairing == "auto":
-        pairing = _pairing(source, target, _cameras(bag))
+        pairing = _pairing(source, target, _cameras(bag, depth))
     if pairing == "keyframe":
-        return [_completed(bag, source, "source", CameraTopics(), alone=True)]
+        return [_completed(bag, source, "source", CameraTopics(), depth, alone=True)]
     # Without names the alphabetically first camera (left, cam0, ...) is the reference: the target.
-    target = _completed(bag, target, "target", source)
-    source = _completed(bag, source, "source", target)
+    target = _completed(bag, target, "target", source, depth)
+    source = _completed(bag, source, "source", target, depth)
     if source.image == target.image:
         raise BagError(f"source and target are both {source.image}: expected two cameras, or --pairing keyframe")
     return [source, target]
@@ -56,29 +65,31 @@ def _pairing(source: CameraTopics, target: CameraTopics, cameras: list[CameraTop
     return "keyframe" if source.image or len(cameras) == 1 else "cameras"
 
 
-def _completed(bag: Bag, given: CameraTopics, name: str, other: CameraTopics, alone: bool = False) -> CameraTopics:
+def _completed(
+    bag: Bag, given: CameraTopics, name: str, other: CameraTopics, depth: bool, alone: bool = False
+) -> CameraTopics:
     """Fill in what was not asked for, from the guessed cameras that the other side does not use."""
     camera = given
     if not given.image:
-        camera = replace(_only_camera(bag, name, other, alone), **{k: v for k, v in vars(given).items() if v})
+        found = _only_camera(bag, name, other, depth, alone)
+        camera = replace(found, **{k: v for k, v in vars(given).items() if v})
     infos = [topic for topic, kind in bag.types.items() if kind in INFO_TYPES]
-    camera = replace(
-        camera,
-        info=camera.info or _info_of(camera.image, infos),
-        depth=camera.depth or _depth_of(camera.image, [topic for topic in _depths(bag) if topic != other.depth]),
-    )
+    camera = replace(camera, info=camera.info or _info_of(camera.image, infos))
+    if depth and not camera.depth:
+        free = [topic for topic in _depths(bag) if topic != other.depth]
+        camera = replace(camera, depth=_depth_of(camera.image, free))
     if not camera.info:
         raise BagError(f"no camera_info found for {camera.image}: give --{name}-info; topics: {bag.listing()}")
-    if not camera.depth:
+    if depth and not camera.depth:
         raise BagError(
             f"no depth found for {camera.image}: expected depth of every camera, registered to its image; "
-            f"give --{name}-depth; topics: {bag.listing()}"
+            f"give --{name}-depth, {WITHOUT_DEPTH}; topics: {bag.listing()}"
         )
     return camera
 
 
-def _only_camera(bag: Bag, name: str, other: CameraTopics, alone: bool) -> CameraTopics:
-    free = [camera for camera in _cameras(bag) if camera.image != other.image]
+def _only_camera(bag: Bag, name: str, other: CameraTopics, depth: bool, alone: bool) -> CameraTopics:
+    free = [camera for camera in _cameras(bag, depth) if camera.image != other.image]
     wanted = 1 if alone or other.image else 2
     if len(free) == wanted:
         return free[0]
@@ -89,8 +100,8 @@ def _only_camera(bag: Bag, name: str, other: CameraTopics, alone: bool) -> Camer
     )
 
 
-def _cameras(bag: Bag) -> list[CameraTopics]:
-    """Colour cameras, one per namespace, sorted; when some have camera_info and depth, only those."""
+def _cameras(bag: Bag, depth: bool) -> list[CameraTopics]:
+    """Colour cameras, one per namespace, sorted; when some have camera_info and, where wanted, depth, only those."""
     infos = [topic for topic, kind in bag.types.items() if kind in INFO_TYPES]
     depths = _depths(bag)
     best: dict[str, str] = {}
@@ -98,12 +109,14 @@ def _cameras(bag: Bag) -> list[CameraTopics]:
         best.setdefault(_stem(topic).rpartition("/")[0], topic)
     cameras = [CameraTopics(topic, _info_of(topic, infos), "") for topic in sorted(best.values())]
     cameras = [camera for camera in cameras if camera.info] or cameras
+    if not depth:
+        return cameras
     # The closest names choose first, and every depth is used once.
     free = list(depths)
     for camera in sorted(cameras, key=lambda c: (-max((_shared(c.image, d) for d in depths), default=0), c.image)):
-        depth = _depth_of(camera.image, free)
-        cameras[cameras.index(camera)] = replace(camera, depth=depth)
-        free = [topic for topic in free if topic != depth]
+        own = _depth_of(camera.image, free)
+        cameras[cameras.index(camera)] = replace(camera, depth=own)
+        free = [topic for topic in free if topic != own]
     return [camera for camera in cameras if camera.depth] or cameras
 
 

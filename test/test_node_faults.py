@@ -92,9 +92,9 @@ def estimates(monkeypatch):
         fault, Estimates.next = Estimates.next, None
         if fault is not None:
             return fault()
-        return PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9)
+        return PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9), None
 
-    monkeypatch.setattr(solver, "estimate_relative_pose", estimate)
+    monkeypatch.setattr(solver, "estimate_with_mixtures", estimate)
     return Estimates
 
 

@@ -84,7 +84,8 @@ def test_the_presets_named_are_those_that_exist() -> None:
 def test_what_cannot_change_while_the_node_runs() -> None:
     fixed = {parameter.name for parameter in parameters() if not parameter.live}
     expected = {"preset", "pairing", "image_transport", "depth_transport", "image_qos", "publish_tf"}
-    assert fixed == expected
+    networks = ("method", "depth_weights", "flash3d_weights", "scene", "semantics", "semantic_weights")
+    assert fixed == expected | {f"reconstruction.{name}" for name in (*networks, "semantic_backbone")}
 
 
 def test_the_groups() -> None:
@@ -101,7 +102,6 @@ def test_the_groups() -> None:
         ("keyframe_rotation", "keyframe_rotation"),
         ("keyframe_lost_after", "keyframe_lost_after"),
         ("rectified", "rectified"),
-        ("preset", "preset"),
     ],
 )
 def test_the_node_and_the_replay_have_the_same_defaults(own: str, option: str) -> None:

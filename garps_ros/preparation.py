@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is settled before the first pair, live and offline: whose depth it is, networks loaded, loops compiled."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from garps_core import compiled
+from garps_core.align import estimate_relative_pose
+from garps_core.config import Config, Lifting, Reconstruction, Start
+from garps_core.errors import ConfigError
+from garps_core.reconstruct import check_settings
+from garps_core.types import Prior, View
+
+NETWORKS = ("depth_anything_v2", "flash3d")
+"""Methods that ask a network for depth; the others need the sensor's."""
+LONG_S = 2.0
+"""Compiled loops that are read from where they were kept take less; more is worth a line."""
+
+
+def needs_depth(config: Config) -> bool:
+    """Whether every image needs the sensor's depth; where a network gives it, the sensor's is left alone."""
+    return config.reconstruction.method not in NETWORKS
+
+
+def check_method(config: Config) -> None:
+    """Raises ConfigError where `reconstruction.method` wants no images, or other settings than these."""
+    if config.reconstruction.method == "ply":
+        raise ConfigError(
+            "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network "
+            f"({', '.join(NETWORKS)}) for images on topics; `garps align a.ply b.ply` takes files"
+        )
+    if not needs_depth(config):
+        check_settings(config)
+
+
+def settings_of_completed(config: Config) -> Config:
+    """The settings for views that already went through `with_depth`: a network's depth then counts as given."""
+    return config.replace({"reconstruction.method": "rgbd"} if config.reconstruction.method == NETWORKS[0] else {})
+
+
+def scale_from(config: Config) -> str:
+    """Where metres come from, for people. Raises WeightsError where the settings' weights are not installed."""
+    if needs_depth(config):
+        return "the depth topics, m"
+    from garps_core.models.store import default  # networks cost nothing where none is used
+
+    settings = config.reconstruction
+    variant = "" if settings.scene == "any" else settings.scene
+    weights = settings.depth_weights or default("depth_anything", variant).name
+    found = f"depth_anything_v2 (weights {weights}), m"
+    if settings.method == "flash3d":
+        found = f"flash3d (weights {settings.flash3d_weights or default('flash3d').name}) on {found}"
+    return found
+
+
+def load_networks(config: Config, say: Callable[[str], None]) -> None:
+    """Load the networks that the settings name, if any, and say what it took.
+
+    Raises:
+        WeightsError: weights that are not installed, or not what they should be.
+        ModelError: a network that does not fit the memory. ConfigError: the device is not there.
+    """
+    settings, begin, names = config.reconstruction, time.perf_counter(), []
+    if needs_depth(config) and settings.semantics == "none":
+        return
+    from garps_core.models import loaded  # networks cost nothing where none is used
+
+    if not needs_depth(config):
+        names.append(scale_from(config).removesuffix(", m"))
+        loaded.on_device(loaded.depth_network(settings.depth_weights, settings.scene), config.device)
+    if settings.method == "flash3d":
+        loaded.flash3d(settings.flash3d_weights, config.device)
+    if settings.semantics != "none":
+        names.append(f"labels ({settings.semantics})")
+        segmenter = loaded.segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
+        loaded.on_device(segmenter, config.device)
+    say(f"loaded {' and '.join(names)} in {time.perf_counter() - begin:.1f} s")
+
+
+def warm_up(config: Config, say: Callable[[str], None]) -> None:
+    """Align a tiny pair, so that what is compiled at first use, or read from where it was kept, is there.
+
+    With numba the first time on a machine takes 10 to 20 s, the next 0.5 s.
+    """
+    if not compiled.AVAILABLE:
+        return
+    begin, view = time.perf_counter(), _corner()
+    # Own settings but for what could leave nothing of so small a picture.
+    tiny = replace(config, reconstruction=Reconstruction(method="rgbd"), lifting=Lifting(), start=Start())
+    estimate_relative_pose(view, view, tiny, Prior(np.eye(4), np.eye(6) * 1e-4))
+    if (spent := time.perf_counter() - begin) > LONG_S:
+        say(f"compiled the innermost loops in {spent:.1f} s; where they can be kept, the next start is quick")
+
+
+def _corner() -> View:
+    """160x120 pixels of two walls and a floor, 2 to 3.3 m away, with a pattern of blots."""
+    noise = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    rgb = cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)
+    v, u = np.mgrid[:120, :160]
+    depth = (2 + 0.01 * abs(u - 80) + 0.004 * v).astype(np.float32)
+    K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
+    return View(np.asarray(rgb, np.uint8), K, depth)
