@@ -45,7 +45,7 @@ def test_peer_finds_the_pose_of_a_room(name, textured):
 def test_splits_share_no_seed_and_hold_every_level():
     tune, report = SPLITS["tune"], SPLITS["report"]
     assert not set(tune.seeds) & set(report.seeds)
-    assert (tune.size, report.size) == (16, 24)
+    assert (tune.size, report.size) == (16, 48)
     assert list(bare.candidates(report))[:5] == [(1000, 1), (1001, 2), (1002, 3), (1003, 4), (1004, 1)]
     for split in (tune, report):
         seeds = [seed for seed, _ in bare.candidates(split)]
