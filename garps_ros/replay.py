@@ -95,6 +95,10 @@ Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupte
 With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong input, 130 = interrupted.
 """
 
+Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
+Reconstruction = Annotated[
+    str | None, typer.Option(help=f"Whose depth, one of {', '.join(METHODS[:-1])}. [auto: the depth topics]")
+]
 ToRos = Annotated[bool, typer.Option("--to-ros", help="Play the recording into a live ROS 2 graph instead.")]
 Rate = Annotated[float, typer.Option(help="With --to-ros: seconds of the recording per second.", min=0.001, max=1000)]
 Loop = Annotated[bool, typer.Option("--loop", help="With --to-ros: again from the start until stopped.")]
@@ -137,12 +141,8 @@ def replay(
         int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
     ] = 5,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
-    preset: Annotated[
-        str | None, typer.Option(help=f"One of {', '.join(PRESETS)}.  [default: default; of a network monocular]")
-    ] = None,
-    reconstruction: Annotated[
-        str | None, typer.Option(help=f"One of {', '.join(METHODS[:-1])}.  [default: auto, the depth topics]")
-    ] = None,
+    preset: Preset = None,
+    reconstruction: Reconstruction = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
@@ -162,9 +162,6 @@ def replay(
     rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after)
     source = CameraTopics(source_image, source_info, source_depth)
     target = CameraTopics(target_image, target_info, target_depth)
-    if not needs_depth(config) and (source_depth or target_depth):
-        method = config.reconstruction.method
-        raise BagError(f"a depth topic is given, and {method} does without: expected one of both")
     with Bag(bag) as recording:
         cameras = choose_cameras(recording, source, target, pairing, needs_depth(config))
         load_networks(config, lambda text: print(text, file=sys.stderr))

@@ -36,6 +36,11 @@ def choose_cameras(
         BagError: a topic that is missing or of another type, no depth, or no one guess; lists what is there.
     """
     _check_given(bag, source, target)
+    if not depth and (source.depth or target.depth):
+        raise BagError(
+            f"depth topic {source.depth or target.depth} is given, and --reconstruction names a network that does "
+            "without: expected one of both"
+        )
     if pairing == "keyframe" and target != CameraTopics():
         raise BagError("--pairing keyframe follows one camera: expected --source-... topics only")
     if pairing == "auto":

@@ -39,7 +39,7 @@ class Worker(Generic[Job, Result]):
         """Why the thread ended although nobody stopped it; empty while it lives."""
         self.error: BaseException | None = None
         """What it ended by."""
-        self.prepared = False
+        self.prepared = prepare is None
         """The thread takes jobs."""
         self._begin()
 

@@ -60,9 +60,9 @@ def calls(monkeypatch):
     """The estimator answers at once; what it was called with."""
     calls = []
 
-    def estimate(source, target, config, prior):
-        calls.append((source, target, config, prior))
-        return with_mixtures(replace(recordings.estimate(source, target), initial=prior), source, target)
+    def estimate(*given):
+        calls.append(given)
+        return with_mixtures(replace(recordings.estimate(*given[:2]), initial=given[3]), *given[:2])
 
     monkeypatch.setattr(solver, "estimate_with_mixtures", estimate)
     return calls
@@ -70,11 +70,7 @@ def calls(monkeypatch):
 
 def answering(monkeypatch, estimate):
     """Let the estimator be `estimate(source, target)`."""
-    monkeypatch.setattr(
-        solver,
-        "estimate_with_mixtures",
-        lambda source, target, config, prior: with_mixtures(estimate(source, target), source, target),
-    )
+    monkeypatch.setattr(solver, "estimate_with_mixtures", lambda s, t, *_: with_mixtures(estimate(s, t), s, t))
 
 
 def with_mixtures(estimate, *views):
