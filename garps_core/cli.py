@@ -147,7 +147,7 @@ def doctor() -> int:
 
     rows, healthy = examine()
     for name, finding in rows:
-        print(f"{name:<11} {finding}")
+        print(f"{name:<15} {finding}")
     return 0 if healthy else 1
 
 

@@ -15,14 +15,17 @@ import torch
 from garps_core.align import align_mixtures
 from garps_core.checks import Float64Array
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
+from garps_core.models.manifest import ALL
+from garps_core.models.store import installed, weights_folder
 from garps_core.types import Mixture, Prior
 
-REQUIRED = ("numpy", "scipy", "torch", "cv2", "poselib", "typer")
+REQUIRED = ("numpy", "scipy", "torch", "cv2", "poselib", "typer", "safetensors")
 OPTIONAL = {
     "rclpy": "ROS 2 nodes; comes with ROS",
     "rosbags": "garps-replay",
     "matplotlib": "--figure",
     "numba": "speed: compiled loops",
+    "huggingface_hub": "garps weights fetch",
 }
 DISTRIBUTIONS = {"cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python")}
 
@@ -36,6 +39,7 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
         found = importlib.util.find_spec(name) is not None
         rows.append((name, version_of(name) if found else f"not installed ({purpose})"))
     rows += [
+        ("weights", weights()),
         ("devices", devices()),
         ("threads", f"{torch.get_num_threads()} of {os.cpu_count()}"),
         ("memory", memory()),
@@ -52,6 +56,12 @@ def version_of(module: str) -> str:
         except importlib.metadata.PackageNotFoundError:
             continue
     return "present, version unknown"
+
+
+def weights() -> str:
+    """Names of the weights that are installed, and their folder."""
+    names = [entry.name for entry in ALL if installed(entry.name)]
+    return f"{', '.join(names) or 'none'}, in {weights_folder()}"
 
 
 def devices() -> str:

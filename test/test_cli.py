@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `garps` command as a user meets it: summaries, JSON, exit codes, one-line errors."""
 
+import importlib.metadata
+import importlib.util
 import json
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from garps_core import cli
+from garps_core import cli, doctor
 from garps_core.geometry import se3_exp, se3_log
 from garps_core.types import PoseEstimate, Prior, Status
 
@@ -187,5 +189,22 @@ def test_help_version_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
     assert "Example:" in capsys.readouterr().out
     assert cli.main(["doctor"]) == 0
     out = capsys.readouterr().out
-    for word in ("python", "torch", "rclpy", "devices", "memory", "self-test   ok"):
+    for word in ("python", "torch", "rclpy", "devices", "memory", "self-test       ok"):
         assert word in out
+
+
+def test_doctor_names_what_networks_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path / "none"))
+    assert doctor.weights() == f"none, in {tmp_path / 'none'}"
+    monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
+    for file in ("depth_anything_v2_metric_vkitti_vits.pth", "dinov2-small-hf.safetensors", "other.pth"):
+        (tmp_path / file).touch()
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "huggingface_hub" else real(name))
+    assert cli.main(["doctor"]) == 0
+    told = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
+    assert told["weights"] == f"depth-anything-v2-outdoor-small, dinov2-small-hf, in {tmp_path}"
+    assert told["safetensors"] == importlib.metadata.version("safetensors")
+    assert told["huggingface_hub"] == "not installed (garps weights fetch)"

@@ -185,11 +185,17 @@ def _of_torch_file(path: Path, real: Path, kind: str | None) -> tuple[dict[str, 
         )
     _check_zip(path, real)
     try:
-        with torch.serialization.safe_globals([argparse.Namespace] if kind in NEEDS_NAMESPACE else []):
-            content = torch.load(real, map_location="cpu", weights_only=True, mmap=True)
+        with real.open("rb") as stream, torch.serialization.safe_globals(_allowed(kind)):
+            misnamed = real.suffix == ".safetensors"  # newer torch believes the name of a path, and maps paths only
+            given = stream if misnamed else real
+            content = torch.load(given, map_location="cpu", weights_only=True, mmap=not misnamed)
     except Exception as error:  # whatever a hostile file provokes
         raise WeightsError(f"{path} {_why(error)}") from None
     return _unwrapped(path, content)
+
+
+def _allowed(kind: str | None) -> list[Any]:
+    return [argparse.Namespace] if kind in NEEDS_NAMESPACE else []
 
 
 _ODD = re.compile(r"(?:GLOBAL|class) ([\w.]+)")

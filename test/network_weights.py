@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights files in the published layout, filled by `golden_rule`, in a folder of weights; and small views."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import golden_rule
+import numpy as np
+import torch
+from test_cli import TRUTH, K, room
+from torch import nn
+
+from garps_core import View
+from garps_core.models.manifest import BY_NAME
+
+DEPTH, FLASH3D, BACKBONE = "depth-anything-v2-indoor-small", "flash3d", "dinov2-small"
+GOLDEN = {
+    DEPTH: ("dav2_vits_metric", None),
+    FLASH3D: ("flash3d", None),
+    BACKBONE: ("dinov2_vits14_ade20k", "backbone"),
+    "dinov2-small-ade20k-linear": ("dinov2_vits14_ade20k", "linear"),
+    "dinov2-small-ade20k-ms": ("dinov2_vits14_ade20k", "ms"),
+}
+
+
+def tensors(name: str) -> dict[str, torch.Tensor]:
+    """Of the official file of that name in `garps weights list`."""
+    return {key: torch.from_numpy(value) for key, value in golden_rule.state(*GOLDEN[name]).items()}
+
+
+def install(folder: Path, *names: str) -> Path:
+    """Write the official files into a folder for $GARPS_WEIGHTS."""
+    torch.exp(torch.zeros(1))  # the first large one of a process may be wrong
+    for name in names:
+        torch.save(tensors(name), folder / BY_NAME[name].local)
+    return folder
+
+
+def pair(depth: bool = False) -> tuple[View, View]:
+    """Two views of 160x120 of a room, the second moved by TRUTH; with exact depth where asked for."""
+    found = [room(T) for T in (np.eye(4), TRUTH)]
+    return tuple(View(rgb, K, metres if depth else None) for rgb, metres in found)
+
+
+def write_pair(folder: Path) -> dict[str, str]:
+    """The same as files: a, b, and their depth a_mm, b_mm."""
+    paths = {}
+    for name, view in zip("ab", pair(depth=True), strict=True):
+        paths[name], paths[f"{name}_mm"] = str(folder / f"{name}.png"), str(folder / f"{name}_mm.png")
+        cv2.imwrite(paths[name], view.rgb[:, :, ::-1])
+        cv2.imwrite(paths[f"{name}_mm"], np.rint(view.depth * 1000).astype(np.uint16))
+    return paths
+
+
+@contextmanager
+def passes(network: nn.Module) -> Iterator[list[tuple[int, ...]]]:
+    """Shapes of what enters the network, pass by pass."""
+    seen: list[tuple[int, ...]] = []
+    hook = network.register_forward_pre_hook(lambda _module, given: seen.append(tuple(given[0].shape)))
+    try:
+        yield seen
+    finally:
+        hook.remove()
