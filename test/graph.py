@@ -202,7 +202,7 @@ class Camera:
         side: "source" or "target": the topics' prefix, and which view (camera 0 or 1 of the pair).
         pair: what to show.
         colour: "raw", "jpeg" or "png".
-        depth: "16UC1" or "32FC1" raw, "png" (16UC1), "compressedDepth" (16UC1).
+        depth: "16UC1" or "32FC1" raw, "png" (16UC1), "compressedDepth" (16UC1); "" for a camera without.
         reliable: QoS of image and depth.
     """
 
@@ -216,11 +216,12 @@ class Camera:
         depth_suffix = {"png": "/compressed", "compressedDepth": "/compressedDepth"}.get(depth, "")
         self.image = peer.publisher(CompressedImage if suffix else Image, f"{side}/image{suffix}", reliable)
         self.camera_info = peer.publisher(CameraInfo, f"{side}/camera_info")
-        self.depth = peer.publisher(CompressedImage if depth_suffix else Image, f"{side}/depth{depth_suffix}", reliable)
+        kind = CompressedImage if depth_suffix else Image
+        self.depth = peer.publisher(kind, f"{side}/depth{depth_suffix}", reliable) if depth else None
 
     @property
-    def publishers(self) -> tuple[Any, Any, Any]:
-        return self.image, self.camera_info, self.depth
+    def publishers(self) -> tuple[Any, ...]:
+        return self.image, self.camera_info, *([self.depth] if self.depth else [])
 
     def publish(self, stamp_ns: int) -> None:
         self.send(self.shot(stamp_ns))
@@ -239,7 +240,7 @@ class Camera:
         """New messages of this camera's view."""
         head = {"stamp_ns": stamp_ns, "frame_id": f"{self._side}_optical"}
         info = ros_messages.camera_info("rclpy", SIZE, K=self._K, D=[0.0] * 5, model="plumb_bob", **head)
-        return Shot(self._image(head), info, self._depth_image(head))
+        return Shot(self._image(head), info, self._depth_image(head) if self._depth else None)
 
     def _image(self, head: dict[str, Any]) -> Any:
         if self._colour == "raw":

@@ -88,8 +88,8 @@ class Rig:
         pytest.fail(f"no pose for any pair; diagnostics: {self.peer.diagnostics()}")
 
 
-def offline(shots, settings=(), prior=None):
-    config = changed_config(Config(), [*CHEAP, *settings])
+def offline(shots, settings=(), prior=None, preset="default"):
+    config = changed_config(Config.preset(preset), [*CHEAP, *settings])
     views = [view_from_messages(shot.image, shot.camera_info, shot.depth)[0] for shot in shots]
     return estimate_relative_pose(*views, config, prior)
 

@@ -78,6 +78,13 @@ def test_an_input_is_silent_after_the_timeout(age_s, level):
     assert inputs(replace(IMAGE, arrivals=arrivals(age_s))).level == level
 
 
+def test_where_only_depth_never_comes_a_network_is_named():
+    depth = replace(IMAGE, role="source/depth")
+    hint = "reconstruction.method:=depth_anything_v2 with preset:=monocular does without depth"
+    assert hint in inputs(FINE, depth).message
+    assert hint not in inputs(IMAGE, depth).message and hint not in inputs(FINE, IMAGE).message
+
+
 def test_a_latched_calibration_is_never_silent():
     assert inputs(FINE, replace(INFO, arrivals=arrivals(age_s=4000, count=1))).level == Level.OK
 

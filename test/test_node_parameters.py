@@ -148,6 +148,14 @@ def test_a_wrong_change_is_refused_with_its_reason(live: Live, values: dict[str,
     assert live.node.get_parameter("lifting.stride").value == Config().lifting.stride
 
 
+def test_what_a_network_needs_stays() -> None:
+    with ros_node(*given("preset:=monocular", "reconstruction.method:=flash3d")) as node:
+        live = Live(node)
+        result = live.set(alignment__depth_errors=False)
+        assert not result.successful and "expected the preset monocular" in result.reason
+        assert live.set(reconstruction__depth_scale=1.1).successful and live.changes == 1
+
+
 def test_what_another_callback_refuses_is_not_applied(live: Live) -> None:
     """Validation must not change anything: a later callback may still refuse."""
 
@@ -173,6 +181,9 @@ MISTAKES = {
     "pairing:=both": "pairing is 'both': expected one of cameras, keyframe",
     "sync_slop:=11.0": "sync_slop is 11.0: expected between 0 and 10 s",
     "device:=tpu": "device is 'tpu', which is not there",
+    "reconstruction.method:=ply": "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network",
+    "reconstruction.method:=depth_anything_v2": "reconstruction.method is depth_anything_v2, whose depth is off by",
+    "reconstruction.metod:=rgbd": "parameter 'reconstruction.metod' does not exist; did you mean 'reconstruction.meth",
     "lifting.strid:=4": "parameter 'lifting.strid' does not exist; did you mean 'lifting.stride'?",
     "start.zzz:=4": "parameter 'start.zzz' does not exist; ",
     "liftin.stride:=4": "parameter 'liftin.stride' does not exist; did you mean 'lifting.stride'?",

@@ -73,6 +73,19 @@ MISTAKES = {
     "info is image": (single_camera, ["--source-info", "/cam/image_raw"], "expected sensor_msgs/msg/CameraInfo"),
     "no images": (without("image_raw"), [], r"found 0 \(none\): give --target-image; topics: /cam/camera_info"),
     "no depth": (without("depth"), [], "no depth found for /cam/image_raw: expected depth of every camera"),
+    "a way without": (without("depth"), [], "--reconstruction depth_anything_v2, whose weights `garps weights fetch d"),
+    "both depths": (
+        single_camera,
+        ["--reconstruction", "flash3d", "--source-depth", "/cam/depth/image_raw"],
+        "depth topic /cam/depth/image_raw is given, and --reconstruction names a network",
+    ),
+    "no weights": (single_camera, ["--set", "reconstruction.method=flash3d"], "run `garps weights fetch depth-an"),
+    "splats": (single_camera, ["--reconstruction", "ply"], "reconstruction.method is ply, mixtures from files"),
+    "depth of a sensor": (
+        single_camera,
+        ["--reconstruction", "depth_anything_v2", "--preset", "sensor"],
+        "expected the preset monocular",
+    ),
     "no info": (without("info"), [], "no camera_info found for /cam/image_raw: give --source-info"),
     "one camera as two": (single_camera, ["--pairing", "cameras"], r"found 1 \(/cam/image_raw\)"),
     "three cameras": (three_cameras, [], r"found 3 \(/a/image_raw; /b/image_raw; /c/image_raw\)"),
@@ -104,7 +117,8 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_one_line_and_code_2(tmp_path, capfd, name):
+def test_mistakes_are_one_line_and_code_2(tmp_path, capfd, name, monkeypatch):
+    monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path / "none"))
     make, options, expected = MISTAKES[name]
     bag = make(tmp_path)
     assert replay.main([str(bag), "--out", str(tmp_path / "out"), *options]) == 2
