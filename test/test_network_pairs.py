@@ -9,12 +9,14 @@ import pytest
 import torch
 from network_weights import GOLDEN, install, pair, passes, write_pair
 from test_cli import K_WORDS, START, TRUTH
+from test_mask2former import ADAPTER, HEAD, random_state
 
 from garps_core import Config, Prior, align_mixtures, cli, metrics, reconstruct
 from garps_core.geometry import se3_exp
 from garps_core.models import depth_anything, loaded
 from garps_core.models.flash3d import PADDED
 from garps_core.models.flash3d_mixture import labels_of, predict_gaussians
+from garps_core.models.mask2former import Mask2Former
 from garps_core.models.semantics import segment
 from garps_core.reconstruct import mixture_of, mixtures_of, with_depth
 from garps_core.splats import write_splats
@@ -210,3 +212,15 @@ def test_splats_and_pictures_do_not_mix(
 ) -> None:
     assert cli.main(["align", *words(splats[0], files["a"]), "--prior", START]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_published_pipeline_is_one_command(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
+    """Up to its mixtures; with a reduced Mask2Former, since the published one has gigabytes."""
+    published = ["--preset", "paper", "--reconstruction", "flash3d", "--set", "reconstruction.semantics=m2f"]
+    assert cli.main(["align", files["a"], files["b"], *K_WORDS, *published]) == 2
+    assert "download it from https://dl.fbaipublicfiles.com/dinov2/dinov2_vitg14/" in capsys.readouterr().err
+    torch.save(random_state(Mask2Former(ADAPTER, HEAD)), tmp_path / "m2f.pth")
+    changes = {"method": "flash3d", "semantics": "m2f", "semantic_weights": str(tmp_path / "m2f.pth")}
+    config = Config.preset("paper").replace({f"reconstruction.{name}": value for name, value in changes.items()})
+    mixture = mixture_of(with_depth(pair()[:1], config)[0], config)
+    assert mixture.labels is not None and set(np.unique(mixture.labels)) <= set(range(HEAD.classes))

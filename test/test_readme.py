@@ -10,8 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from network_weights import install
 
 from garps_core import Config, cli, metrics
+from garps_core.models import depth_anything
 from garps_ros import replay
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,6 +61,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     return place, cameras.T_1_0
 
 
+def test_the_example_without_depth_asks_for_the_network_it_names(
+    folder: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It finds the file that the line above it fetches; with pseudo-random parameters the pose means nothing."""
+    monkeypatch.chdir(folder[0])
+    fetch, words = [
+        words for words in commands(README) if {"fetch", "align"} & set(words[1:3]) and len(words) in (4, 9)
+    ]
+    assert words[:2] == ["garps", "align"] and words[-5] == "--K"
+    monkeypatch.setenv("GARPS_WEIGHTS", str(folder[0]))
+    assert cli.main(words[1:]) == 2
+    assert " ".join(fetch) in capsys.readouterr().err
+    install(folder[0], fetch[-1])
+    monkeypatch.setattr(depth_anything, "SHORT_SIDE", 70)
+    assert cli.main(words[1:]) in (0, 1)
+    assert "depth " in capsys.readouterr().out
+
+
 def test_the_python_example_finds_the_pose(
     folder: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -79,7 +99,7 @@ def test_the_command_line_example_works(
     folder: tuple[Path, np.ndarray], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder[0])
-    (words,) = [words for words in commands(README) if words[:2] == ["garps", "align"]]
+    (words,) = [words for words in commands(README) if words[:2] == ["garps", "align"] and "--depth-source" in words]
     assert cli.main(words[1:]) == 0
     assert "converged" in capsys.readouterr().out
     assert (folder[0] / "pair.png").stat().st_size > 10_000
@@ -134,7 +154,7 @@ def test_named_options_exist(path: Path, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.parametrize("path", PAGES, ids=name)
 def test_named_settings_exist(path: Path) -> None:
     known = Config().settings()
-    for setting in re.findall(r"(?<![\w.])((?:lifting|start|alignment)\.\w+)(?![\w.]|\()", spoken(path)):
+    for setting in re.findall(r"(?<![\w.])((?:reconstruction|lifting|start|alignment)\.\w+)(?![\w.]|\()", spoken(path)):
         assert setting in known or setting == "alignment.md"
 
 
