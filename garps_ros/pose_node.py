@@ -28,14 +28,18 @@ Its callbacks take milliseconds, so that is not the node's doing: a reader of Fa
 the call that takes a message, where neither Python's threads nor its signal handlers run. The watch is in C.
 """
 
-HELP = """The pose of one camera in another, in metres with covariance, from two RGB-D cameras; or the path of one.
+HELP = """The pose of one camera in another, in metres with covariance, from two cameras; or the path of one.
+
+Depth comes from a topic of each camera, or from a network: -p reconstruction.method:=depth_anything_v2 (or flash3d)
+-p preset:=monocular, with weights that `garps weights fetch` has installed.
 
 usage: pose_node [--help] [--ros-args ...]
 
 Subscribes (remap with -r source/image:=/left/image_rect ...)
   source/image, target/image              sensor_msgs/Image, or CompressedImage with -p image_transport:=compressed
   source/camera_info, target/camera_info  sensor_msgs/CameraInfo
-  source/depth, target/depth              depth registered to the image: 16UC1 millimetres or 32FC1 metres
+  source/depth, target/depth              depth registered to the image: 16UC1 millimetres or 32FC1 metres; not with
+                                          a network
   ~/prior                                 geometry_msgs/PoseWithCovarianceStamped: source in target, if known (optional)
 Publishes
   ~/pose          geometry_msgs/PoseStamped: pose of the source camera in the target's optical frame
@@ -50,6 +54,9 @@ examples:
   ros2 run garps_ros pose_node --ros-args -r source/image:=/right/image_rect -r target/image:=/left/image_rect \\
       -r source/camera_info:=/right/camera_info -r target/camera_info:=/left/camera_info \\
       -r source/depth:=/right/depth -r target/depth:=/left/depth
+  ros2 run garps_ros pose_node --ros-args -p reconstruction.method:=depth_anything_v2 -p preset:=monocular \\
+      -r source/image:=/right/image_rect -r source/camera_info:=/right/camera_info \\
+      -r target/image:=/left/image_rect -r target/camera_info:=/left/camera_info
   ros2 run garps_ros pose_node --ros-args -p pairing:=keyframe -r source/image:=/camera/color/image_raw ...
 """
 

@@ -27,7 +27,12 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
         (),
         "its CameraInfo; empty: camera_info beside the image (/left/image_rect: /left/camera_info)",
     ),
-    ("source_depth", "source/depth", (), "its depth, registered to the image: 16UC1 in mm or 32FC1 in m"),
+    (
+        "source_depth",
+        "source/depth",
+        (),
+        "its depth, registered to the image: 16UC1 in mm or 32FC1 in m; not used with a network",
+    ),
     (
         "target_image",
         "target/image",
@@ -36,6 +41,13 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ),
     ("target_info", "", (), "its CameraInfo; empty: camera_info beside the image"),
     ("target_depth", "target/depth", (), "its depth, registered to the image"),
+    (
+        "reconstruction",
+        "",
+        ("", "auto", "rgbd", "depth_anything_v2", "flash3d"),
+        "reconstruction.method: auto and rgbd take the depth topics, the others are networks and do without; give them "
+        f"preset:=monocular; empty: {AS_IN_FILE}",
+    ),
     ("image_transport", "", ("", "raw", "compressed"), f"compressed: subscribe IMAGE/compressed; empty: {AS_IN_FILE}"),
     ("pairing", "", ("", "cameras", "keyframe"), f"two cameras, or one against its keyframe; empty: {AS_IN_FILE}"),
     (
@@ -105,6 +117,8 @@ def remappings(given: dict[str, str]) -> list[tuple[str, str]]:
 def parameters(given: dict[str, str]) -> dict[str, str | bool]:
     """What goes over the parameter file: only what was given, so that the file keeps its say on the rest."""
     texts = {name: given[name] for name in ("image_transport", "pairing", "preset", "target_frame") if given[name]}
+    if given["reconstruction"]:
+        texts["reconstruction.method"] = given["reconstruction"]
     flags = {name: given[name] == "true" for name in ("publish_tf", "use_sim_time") if given[name]}
     return {**texts, **flags}
 

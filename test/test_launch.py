@@ -128,14 +128,16 @@ def test_parameters_have_the_names_and_types_of_the_node(description: list[Any])
         target_frame="right_optical",
         publish_tf="true",
         use_sim_time="true",
+        reconstruction="depth_anything_v2",
     )
     given = node.parameters[1]
     assert given.pop("use_sim_time") is True  # rclpy's own
-    assert len(given) == 5
+    assert len(given) == 6
     for name, value in given.items():
         assert type(value) is type(known[name])
-    settings, _ = settings_from(known | given)
+    settings, config = settings_from(known | given)
     assert settings.publish_tf and settings.pairing == "keyframe"
+    assert config.reconstruction.method == "depth_anything_v2"
 
 
 def test_every_choice_is_one_the_node_accepts(description: list[Any]) -> None:
@@ -146,6 +148,8 @@ def test_every_choice_is_one_the_node_accepts(description: list[Any]) -> None:
             seen.add(argument.name)
             words = {choice for choice in argument.choices if choice}
             assert words == (set(known[argument.name].choices) or {"true", "false"}), argument.name
+        if isinstance(argument, DeclareLaunchArgument) and argument.name == "reconstruction":
+            assert set(argument.choices or ()) == {"", *known["reconstruction.method"].choices} - {"ply"}
     assert seen == {"pairing", "preset", "image_transport", "publish_tf"}
 
 
