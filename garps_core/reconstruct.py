@@ -32,6 +32,7 @@ def reconstruct(view: View, config: Config | None = None) -> Mixture:
         ConfigError: settings that do not go together.
         WeightsError: weights that are not installed, or not what they should be.
         ModelError: a network that does not fit the memory, or whose output is not finite.
+        InputError: a picture too elongated for a network.
     """
     config = config or Config()
     return mixture_of(with_depth([view], config)[0], config)

@@ -7,6 +7,7 @@ import typer
 from torch import nn
 
 from bench.networks import BAR_SHARE, MATRIX, Case, chosen, counted_flop, measured
+from bench.networks_pair import STAGES, measured_pair
 from garps_core.models import depth_anything
 from garps_core.models.vit import Attention
 
@@ -42,3 +43,19 @@ def test_cases_are_chosen_by_network_and_size():
         chosen("nothing", "vits")
     with pytest.raises(typer.BadParameter, match=r"no size vitx.*vits"):
         chosen("", "vitx")
+
+
+def test_a_line_of_the_table_of_pairs(monkeypatch):
+    """The network runs, its answer is a room's depth: so the pair is found, and every stage has its time."""
+    pytest.importorskip("trimesh")
+    monkeypatch.setenv("GARPS_WEIGHTS", "restored afterwards")
+    monkeypatch.setattr(depth_anything, "SHORT_SIDE", 140)
+    before = torch.get_num_threads()
+    try:
+        row = measured_pair("depth_anything_v2", runs=1, threads=1)
+    finally:
+        torch.set_num_threads(before)
+    assert row["status"] == "converged"
+    assert all(row[f"{stage} s"] > 0 for stage in STAGES)
+    assert sum(row[f"{stage} s"] for stage in STAGES) == pytest.approx(row["wall s"], rel=0.2)
+    assert 0 < row["beyond imports MiB"] < row["peak MiB"]
