@@ -252,11 +252,16 @@ def _add_moments(v: Float64, missing: Float64, rows: int, out: Float64, turning:
         v[23 * ROWS + r] -= q * u1 * u2
         v[24 * ROWS + r] -= q * u2 * u2
     for a in range(10):
-        for b in range(15):
-            s = 0.0
+        for b in range(0, 15, 3):
+            s0 = s1 = s2 = 0.0
             for r in range(rows):
-                s += v[a * ROWS + r] * v[(10 + b) * ROWS + r]
-            out[a, b] += s
+                power = v[a * ROWS + r]
+                s0 += power * v[(10 + b) * ROWS + r]
+                s1 += power * v[(11 + b) * ROWS + r]
+                s2 += power * v[(12 + b) * ROWS + r]
+            out[a, b] += s0
+            out[a, b + 1] += s1
+            out[a, b + 2] += s2
 
 
 @loop
