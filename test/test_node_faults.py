@@ -90,9 +90,8 @@ def estimates(monkeypatch):
 
     def estimate(source, target, config, prior=None):
         fault, Estimates.next = Estimates.next, None
-        if fault is not None:
-            return fault()
-        return PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9), None
+        found = PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9) if fault is None else fault()
+        return found, None
 
     monkeypatch.setattr(solver, "estimate_with_mixtures", estimate)
     return Estimates
@@ -197,10 +196,12 @@ def test_a_loop_that_stalls_ends_the_process_and_says_where():
         class Executor:
             def spin_once(self, timeout_sec):
                 stalled_in_here()
+        class Node:
+            refusal = ""
         def stalled_in_here():
             time.sleep(60)
         pose_node.STALL_S = 0.5
-        pose_node._run(Executor(), None, None, [])
+        pose_node._run(Executor(), None, Node(), [])
     """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=30)
     assert done.returncode == 1
