@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact nearest neighbours of a camera's surfaces, compiled: partners sorted into cells of the image they came from.
+"""Who is paired with whom, compiled: what a camera sees, exact nearest neighbours, and what is gathered of them.
 
-Faster than a k-d tree because a surface seen by a camera is nearly flat in the image: the neighbours of a point lie in
+Neighbours are found with the partners sorted into cells of the image they came from:
+faster than a k-d tree because a surface seen by a camera is nearly flat in the image: the neighbours of a point lie in
 the cells around its pixel. `pairing.py` falls back on SciPy's tree.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from garps_core.compiled import Float32, Int64, loop
 
@@ -141,3 +143,44 @@ def _sorted_into_cells(
         order[place[of[i]]] = i
         place[of[i]] += 1
     return first, order
+
+
+@loop
+def gathered(
+    index: Int64, means: Float32, covariances: Float32, log_weights: Float32, colours: Float32, row_colours: Float32,
+    per_colour: float,
+) -> tuple[Float32, Float32, Float32]:  # fmt: skip
+    """Partners' means (3, k, n), covariances (6, k, n) and log weights less colour cost (k, n); index (n, k)."""
+    n, k = index.shape
+    y, S = np.empty((3, k, n), np.float32), np.empty((6, k, n), np.float32)
+    weights = np.empty((k, n), np.float32)
+    cost = np.float32(per_colour)
+    for i in range(n):
+        for j in range(k):
+            p = index[i, j]
+            for axis in range(3):
+                y[axis, j, i] = means[p, axis]
+            for element in range(6):
+                S[element, j, i] = covariances[p, element]
+            red = row_colours[i, 0] - colours[p, 0]
+            green = row_colours[i, 1] - colours[p, 1]
+            blue = row_colours[i, 2] - colours[p, 2]
+            weights[j, i] = log_weights[p] - cost * (red * red + green * green + blue * blue)
+    return y, S, weights
+
+
+@loop
+def seen(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ratio: float) -> npt.NDArray[np.bool_]:
+    """Mask (n,) of points (n, 3) that the other camera sees (`pairing.visible`)."""
+    height, width = depth.shape
+    mask = np.zeros(len(points), np.bool_)
+    reach = np.float32(1 + ratio)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        forward = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        if forward > np.float32(1e-3):
+            u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / forward * K[0, 0] + K[0, 2]
+            v = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / forward * K[1, 1] + K[1, 2]
+            if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:
+                mask[i] = not (forward > depth[int(np.rint(v)), int(np.rint(u))] * reach)
+    return mask

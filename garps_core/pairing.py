@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from garps_core import compiled, neighbours
+from garps_core import neighbours
 from garps_core.config import Alignment, Config, Rung
 from garps_core.errors import ConfigError
 from garps_core.geometry import Array, se3_inverse
@@ -91,7 +91,7 @@ def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: floa
     depth = torch.as_tensor(other.depth, dtype=like.dtype, device=like.device)
     if on_compiled_path(like):
         points, turn, shift, camera, map_ = (part.contiguous().numpy() for part in (like, R, t, K, depth))
-        return torch.from_numpy(compiled.seen(points, turn, shift, camera, map_, occlusion_ratio))
+        return torch.from_numpy(neighbours.seen(points, turn, shift, camera, map_, occlusion_ratio))
     height, width = depth.shape
     p = like @ R.T + t
     z = p[:, 2].clamp_min(1e-6)
@@ -151,7 +151,7 @@ def _gathered(
             part.contiguous().numpy()
             for part in (partners.means, covariances, log_weights, partners.colours, rows.colours)
         )
-        y, S, w = compiled.gathered(index.numpy(), means, packed, weights, colours, own, per_colour)
+        y, S, w = neighbours.gathered(index.numpy(), means, packed, weights, colours, own, per_colour)
         return torch.from_numpy(y), torch.from_numpy(S), torch.from_numpy(w)
     chosen = index.T.contiguous()
     cost = torch.stack([(rows.colours[:, c][None] - partners.colours[:, c][chosen]) ** 2 for c in range(3)]).sum(0)
