@@ -60,6 +60,27 @@ def exponential(x: np.float32) -> np.float32:
 
 
 @loop
+def logarithm(s: np.float32) -> np.float32:
+    """log(1 + s) for finite s >= 0, relative error 1e-6: n log 2 and an odd series of f / (2 + f) (fdlibm's logf).
+
+    Below 0.1 its Taylor series, since 1 + s would lose digits that the compiler may not be told to keep.
+    """
+    one, half = np.float32(1), np.float32(0.5)
+    few = one / np.float32(4) - s * (one / np.float32(5) - s / np.float32(6))
+    few = s * (one - s * (half - s * (one / np.float32(3) - s * few)))
+    bits = np.int32(np.float32(one + s).view(np.int32) + np.int32(0x3F800000 - 0x3F3504F3))
+    n = np.float32(np.int32(bits >> np.int32(23)) - np.int32(127))
+    f = np.int32((bits & np.int32(0x007FFFFF)) + np.int32(0x3F3504F3)).view(np.float32) - one
+    t = f / (np.float32(2) + f)
+    z = t * t
+    series = np.float32(0.24279078841) * z + np.float32(0.28498786688)
+    series = (series * z + np.float32(0.40000972152)) * z + np.float32(0.66666662693)
+    square = half * f * f
+    many = n * np.float32(0.69314718056) + (t * (square + series * z) - square + f)
+    return few if s < np.float32(0.1) else many
+
+
+@loop
 def row_sums(
     mu: Float32, S: Float32, partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32
 ) -> Float32:
@@ -93,7 +114,7 @@ def evaluated(
     """
     n = len(means)
     w, total = np.empty(20 * ROWS, np.float32), np.empty(16 * ROWS, np.float32)
-    v, missing = np.empty(31 * ROWS), np.empty(ROWS)
+    v, missing, share = np.empty(31 * ROWS), np.empty(ROWS), np.empty(ROWS)
     out, turning = np.zeros((10, 15)), np.zeros((6, 6))
     value = support = 0.0
     for begin in range(0, n, ROWS):
@@ -102,21 +123,25 @@ def evaluated(
             for r in range(rows):
                 x, y, z = means[begin + r, 0], means[begin + r, 1], means[begin + r, 2]
                 w[plane * ROWS + r] = R[plane, 0] * x + R[plane, 1] * y + R[plane, 2] * z + t[plane]
+        for r in range(rows):  # into planes, for the time being in `total`
+            for element in range(6):
+                total[element * ROWS + r] = own[begin + r, element]
         for plane in range(6):
+            a, b, c, e, f, i = turn[plane]
             for r in range(rows):
-                turned = np.float32(0)
-                for element in range(6):
-                    turned += turn[plane, element] * own[begin + r, element]
+                turned = a * total[r] + b * total[ROWS + r] + c * total[2 * ROWS + r]
+                turned += e * total[3 * ROWS + r] + f * total[4 * ROWS + r] + i * total[5 * ROWS + r]
                 w[(3 + plane) * ROWS + r] = turned
         _sum_partners(w, total, begin, rows, partners, covariances, log_weights, floor)
         for r in range(rows):
             s, weight = np.float64(total[r]), np.float64(weights[begin + r])
-            value += weight * np.log1p(s)
-            c = weight / (1 + s)
-            support += c * s
-            for plane in range(15):
-                v[(10 + plane) * ROWS + r] = total[(1 + plane) * ROWS + r] * c
+            value += weight * logarithm(total[r])
+            share[r] = weight / (1 + s)
+            support += share[r] * s
             missing[r] = 1 / max(weight, 1e-300)
+        for plane in range(15):
+            for r in range(rows):
+                v[(10 + plane) * ROWS + r] = total[(1 + plane) * ROWS + r] * share[r]
         for plane in range(6):
             for r in range(rows):
                 v[(25 + plane) * ROWS + r] = w[(3 + plane) * ROWS + r]
@@ -176,7 +201,7 @@ def _add_partner(w: Float32, total: Float32, rows: int) -> None:
         u2 = p2 * d0 + p4 * d1 + p5 * d2
         D = d0 * u0 + d1 * u1 + d2 * u2
         exponent = min(max(w[19 * ROWS + r] - np.float32(0.5) * D, np.float32(-60)), np.float32(80))
-        g = exponential(exponent) * (np.sqrt(r0 * r1) * np.sqrt(p5))
+        g = exponential(exponent) * np.sqrt(r0 * r1 * p5)
         g0, g1, g2 = g * u0, g * u1, g * u2
         total[r] += g
         total[ROWS + r] += g0
