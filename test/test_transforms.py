@@ -206,7 +206,7 @@ def ros(monkeypatch, tmp_path):
 
 
 def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd):
-    monkeypatch.setattr(solver, "estimate_relative_pose", recordings.estimate)
+    monkeypatch.setattr(solver, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
     node = PoseNode(ros)
     executor = SingleThreadedExecutor(context=ros.context)
     executor.add_node(ros)
