@@ -8,7 +8,7 @@ import pytest
 from garps_core import Config
 
 pytest.importorskip("optuna")
-from bench import tune  # noqa: E402
+from bench import tune
 
 
 def rows(error_m=0.01, nees=5.0, count=20, **other):
