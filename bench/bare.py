@@ -57,7 +57,7 @@ class Split:
         return self.per_level * len(LEVELS)
 
 
-SPLITS = {"tune": Split(range(100), 4), "report": Split(range(1000, 1400), 12)}
+SPLITS = {"tune": Split(range(100), 4), "report": Split(range(2000, 2400), 12)}
 
 
 def candidates(split: Split) -> Iterator[tuple[int, int]]:

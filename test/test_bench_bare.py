@@ -46,7 +46,7 @@ def test_splits_share_no_seed_and_hold_every_level():
     tune, report = SPLITS["tune"], SPLITS["report"]
     assert not set(tune.seeds) & set(report.seeds)
     assert (tune.size, report.size) == (16, 48)
-    assert list(bare.candidates(report))[:5] == [(1000, 1), (1001, 2), (1002, 3), (1003, 4), (1004, 1)]
+    assert list(bare.candidates(report))[:5] == [(2000, 1), (2001, 2), (2002, 3), (2003, 4), (2004, 1)]
     for split in (tune, report):
         seeds = [seed for seed, _ in bare.candidates(split)]
         assert len(seeds) == len(set(seeds))
