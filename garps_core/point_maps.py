@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a two-view network says of a pair: for every pixel of both pictures the point it sees, in one camera's frame.
+
+Any network of this family fits in here: MASt3R and DUSt3R do, and so would a newer one (`docs/two_view_models.md`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from garps_core.checks import Float32Array, Float64Array
+from garps_core.geometry import Array
+
+Picture = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class PointMap:
+    """The points that the pixels of one picture see.
+
+    Args:
+        points: hxwx3 float32, x right, y down, z forward in the frame of the order's first camera; metres if the
+            network is metric.
+        confidence: hxw float32; the larger, the surer, on the network's own scale.
+        descriptors: hxwxC float32 unit vectors that are alike where two pixels see the same, or None.
+    """
+
+    points: Float32Array
+    confidence: Float32Array
+    descriptors: Float32Array | None = None
+
+
+@dataclass(frozen=True)
+class Framing:
+    """Which part of an image a network sees, and how large.
+
+    With coordinates counted from the corner of the first pixel: seen = image * scale - offset.
+
+    Args:
+        scale: (x, y), network pixels per image pixel.
+        offset: (x, y) network pixels cut off on the left and at the top.
+        size: (rows, columns) of what the network sees.
+    """
+
+    scale: tuple[float, float]
+    offset: tuple[float, float]
+    size: tuple[int, int]
+
+    def intrinsics(self, K: Float64Array) -> Float64Array:
+        """3x3 K of the image -> 3x3 of what the network sees; both with pixel centres at integers."""
+        seen = np.array(K, np.float64)
+        for axis in (0, 1):
+            seen[axis, axis] = K[axis, axis] * self.scale[axis]
+            seen[axis, 2] = (K[axis, 2] + 0.5) * self.scale[axis] - self.offset[axis] - 0.5
+        return seen
+
+    def to_image(self, px: Array) -> Array:
+        """(n, 2) pixels x, y that the network sees -> pixels of the image; both with pixel centres at integers."""
+        return np.asarray((px + 0.5 + self.offset) / self.scale - 0.5, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class PairMaps:
+    """Both orders of a pair.
+
+    Args:
+        source_first: point maps of source and target, both in the source camera's frame.
+        target_first: point maps of target and source, both in the target camera's frame.
+        framings: of source and target.
+        metric: whether the network's unit is the metre.
+        origin: the network's name.
+    """
+
+    source_first: tuple[PointMap, PointMap]
+    target_first: tuple[PointMap, PointMap]
+    framings: tuple[Framing, Framing]
+    metric: bool
+    origin: str
+
+
+class TwoViewModel(Protocol):
+    """What a two-view network has to be able to do; see `PairMaps`."""
+
+    def __call__(self, source: Picture, target: Picture) -> PairMaps:
+        """Point maps of two pictures HxWx3 uint8 RGB, of any sizes, in both orders.
+
+        Raises:
+            ModelError: too little memory, or values that are not finite. InputError: a picture it cannot take.
+        """
