@@ -14,6 +14,7 @@ from torch import nn
 
 from garps_core import View
 from garps_core.models.manifest import BY_NAME
+from garps_core.models.two_view import Architecture, Stack
 
 DEPTH, FLASH3D, BACKBONE = "depth-anything-v2-indoor-small", "flash3d", "dinov2-small"
 GOLDEN = {
@@ -63,3 +64,25 @@ def passes(network: nn.Module) -> Iterator[list[tuple[int, ...]]]:
         yield seen
     finally:
         hook.remove()
+
+
+TWO_VIEW = {"mast3r_small": "mast3r", "dust3r_dpt_small": "dust3r", "dust3r_linear_small": "dust3r"}
+"""Reduced two-view networks with golden values -> their kind."""
+
+
+def two_view_architecture(name: str) -> Architecture:
+    """Of a golden two-view network; the reduced ones have attention heads that are not 64 wide."""
+    told = golden_rule.keys(name)["arch"]
+    sizes = (tuple(told[f"{part}_{what}"] for what in ("embed_dim", "depth", "num_heads")) for part in ("enc", "dec"))
+    encoder, decoder = (Stack(*size) for size in sizes)
+    return Architecture(encoder, decoder, told["head_type"] == "linear", 24 if told.get("two_confs") else 0)
+
+
+def two_view_tensors(name: str) -> dict[str, torch.Tensor]:
+    """As a safetensors file holds them, without second names."""
+    return {key: torch.from_numpy(value) for key, value in golden_rule.state(name).items()}
+
+
+def with_aliases(name: str, held: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """As a torch file holds them, some under two names."""
+    return held | {alias: held[own] for alias, own in golden_rule.keys(name)["aliases"].items()}

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,6 @@ from garps_core.models.files import read_tensors, write_tensors
 from garps_core.models.loading import check_finite, kind_of, recognised
 from garps_core.models.manifest import ALL, MAX_DEPTH_M, Weights, of_file
 
-_ALIAS = re.compile(r"(.*\.scratch\.)layer_rn\.([0-3])\.(.*)")
 _SIZES = {384: "vits", 768: "vitb", 1024: "vitl", 1536: "vitg"}
 
 
@@ -62,18 +59,11 @@ def needed(kind: str, tensors: Mapping[str, torch.Tensor]) -> tuple[dict[str, to
         from garps_core.models.flash3d import flash3d_tensors
 
         return flash3d_tensors(tensors)
-    kept = {}
-    left: Counter[str] = Counter()
-    for key, tensor in tensors.items():
-        alias = _ALIAS.fullmatch(key)
-        name = f"{alias[1]}layer{int(alias[2]) + 1}_rn.{alias[3]}" if alias else key
-        if alias and name in tensors:
-            if not torch.equal(tensor, tensors[name]):
-                raise WeightsError(f"{key} differs from {name}: expected the same values under both names")
-            left[f"{alias[1]}layer_rn"] += 1
-        else:
-            kept[name] = tensor
-    return kept, dict(left)
+    if kind in ("mast3r", "dust3r"):
+        from garps_core.models.two_view_heads import without_aliases
+
+        return without_aliases(tensors)
+    return dict(tensors), {}
 
 
 def _checked_variant(source: Path, kind: str, variant: str, known: Weights | None) -> str:
