@@ -3,23 +3,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float64Array
 
 LANCZOS_LOBES = 3
+CUBIC_STEEPNESS = -0.5
+"""Slope of the cubic kernel one pixel away from its centre."""
+FRACTION_BITS = 22
+"""Of the weights, which are rounded, so that their sums are the same on every machine."""
 
+Bytes = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.intp]
+Weights = npt.NDArray[np.int32]
+Kernel = Callable[[Float64Array], Float64Array]
 
 
-def lanczos(picture: npt.NDArray[np.uint8], height: int, width: int) -> npt.NDArray[np.uint8]:
+def lanczos(picture: Bytes, height: int, width: int) -> Bytes:
     """HxWxC uint8 -> height x width x C by Lanczos-3, whose support widens where the picture shrinks.
 
     Both sides go on their own scale, columns first; either pass is rounded and clipped to bytes.
     """
-    narrowed = _resized_lines(picture.swapaxes(0, 1), width).swapaxes(0, 1)
-    return np.ascontiguousarray(_resized_lines(narrowed, height))
+    return _resized(picture, height, width, _windowed_sinc, LANCZOS_LOBES)
+
+
+def bicubic(picture: Bytes, height: int, width: int) -> Bytes:
+    """The same by the cubic kernel of Catmull and Rom."""
+    return _resized(picture, height, width, _cubic, 2)
 
 
 def nearest_index(size: int, wanted: int) -> Index:
@@ -27,24 +40,38 @@ def nearest_index(size: int, wanted: int) -> Index:
     return np.asarray((2 * np.arange(wanted) + 1) * size // (2 * wanted), np.intp)
 
 
-def _resized_lines(lines: npt.NDArray[np.uint8], wanted: int) -> npt.NDArray[np.uint8]:
-    """The first axis to `wanted` entries."""
-    index, weights = _taps(len(lines), wanted)
-    total = np.zeros((wanted, *lines.shape[1:]))
+def _windowed_sinc(away: Float64Array) -> Float64Array:
+    return np.asarray(np.sinc(away) * np.sinc(away / LANCZOS_LOBES), np.float64)
+
+
+def _cubic(away: Float64Array) -> Float64Array:
+    a, x = CUBIC_STEEPNESS, np.abs(away)
+    near, far = ((a + 2) * x - (a + 3)) * x**2 + 1, a * (((x - 5) * x + 8) * x - 4)
+    return np.asarray(np.where(x < 1, near, far), np.float64)
+
+
+def _resized(picture: Bytes, height: int, width: int, kernel: Kernel, reach: int) -> Bytes:
+    narrowed = _resized_lines(picture.swapaxes(0, 1), *_taps(picture.shape[1], width, kernel, reach)).swapaxes(0, 1)
+    return np.ascontiguousarray(_resized_lines(narrowed, *_taps(len(narrowed), height, kernel, reach)))
+
+
+def _resized_lines(lines: Bytes, index: Index, weights: Weights) -> Bytes:
+    """The first axis to as many entries as there are of index and weights."""
+    total = np.full((len(index), *lines.shape[1:]), 1 << (FRACTION_BITS - 1), np.int32)
     for tap in range(index.shape[1]):
         total += weights[:, tap, None, None] * lines[index[:, tap]]
-    return np.clip(np.floor(total + 0.5), 0, 255).astype(np.uint8)
+    return np.asarray((total >> FRACTION_BITS).clip(0, 255), np.uint8)
 
 
-def _taps(size: int, wanted: int) -> tuple[Index, Float64Array]:
-    """For every wanted entry the entries it reads, and their weights with sum 1; both (wanted, taps)."""
+def _taps(size: int, wanted: int, kernel: Kernel, reach: int) -> tuple[Index, Weights]:
+    """For every wanted entry the entries it reads, and their weights with sum 2**FRACTION_BITS; both (wanted, taps)."""
     scale = size / wanted
     stretch = max(scale, 1.0)
-    reach = LANCZOS_LOBES * stretch
     centre = (np.arange(wanted) + 0.5) * scale
-    first = np.floor(centre - reach).astype(np.intp)
-    index = first[:, None] + np.arange(int(np.ceil(2 * reach)) + 1)
+    first = np.floor(centre - reach * stretch).astype(np.intp)
+    index = first[:, None] + np.arange(int(np.ceil(2 * reach * stretch)) + 1)
     away = (index + 0.5 - centre[:, None]) / stretch
-    inside = (index >= 0) & (index < size) & (np.abs(away) < LANCZOS_LOBES)
-    weights = np.where(inside, np.sinc(away) * np.sinc(away / LANCZOS_LOBES), 0.0)
-    return index.clip(0, size - 1), weights / weights.sum(axis=1, keepdims=True)
+    inside = (index >= 0) & (index < size) & (np.abs(away) < reach)
+    weights = np.where(inside, kernel(away), 0.0)
+    weights *= (1 << FRACTION_BITS) / weights.sum(axis=1, keepdims=True)
+    return index.clip(0, size - 1), (np.sign(weights) * np.floor(np.abs(weights) + 0.5)).astype(np.int32)
