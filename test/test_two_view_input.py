@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What MASt3R and DUSt3R see of a picture, and that both orders of a pair come out however they are computed."""
 
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from golden_rule import chw, image
 from network_weights import TWO_VIEW, two_view_architecture, two_view_tensors
+from safetensors.torch import save_file
 
 from garps_core.errors import ConfigError, InputError, ModelError
 from garps_core.models.naver import KEPT, NaverModel, prepared, prepared_square
+from garps_core.models.plausible import check_file
 from garps_core.models.two_view import Architecture, Stack, TwoView, built_from
 from garps_core.point_maps import PairMaps, PointMap, TwoViewModel
 
@@ -36,11 +40,14 @@ def networks() -> dict[str, TwoView]:
     return {name: built_from(two_view_tensors(name), two_view_architecture(name)) for name in TWO_VIEW}
 
 
+TINY = Architecture(Stack(64, 1, 1), Stack(64, 1, 1), descriptors=5)
+
+
 @pytest.fixture
 def tiny() -> TwoView:
     """Of random parameters, for what does not depend on them."""
     torch.manual_seed(0)
-    return TwoView(Architecture(Stack(64, 1, 1), Stack(64, 1, 1), descriptors=5)).eval().requires_grad_(False)
+    return TwoView(TINY).eval().requires_grad_(False)
 
 
 def model(network: TwoView, variant: str = "", dtype: torch.dtype = torch.float32) -> NaverModel:
@@ -314,6 +321,41 @@ def test_what_half_precision_costs(networks: dict[str, TwoView], dtype: torch.dt
         assert 0 < np.median(error) < bound
         assert other.points.dtype == np.float32
         np.testing.assert_allclose(np.linalg.norm(other.descriptors, axis=-1), 1, atol=1e-5)
+
+
+def check(path: Path, kind: str) -> dict[str, tuple[str, bool]]:
+    return {name: (words, good) for name, words, good in check_file(path, kind=kind)}
+
+
+PLAUSIBLE = {"linear": Architecture(Stack(64, 1, 1), Stack(64, 1, 1), linear=True), "mast3r": TINY}
+
+
+@pytest.mark.parametrize("kind", PLAUSIBLE)
+def test_check_says_what_a_file_sees(tmp_path: Path, kind: str) -> None:
+    """Noise fits, but no room is that near."""
+    torch.manual_seed(3)
+    network, path = TwoView(PLAUSIBLE[kind]), tmp_path / "mine.pth"
+    torch.save({"args": Namespace(), "model": network.state_dict()}, path)
+    found = check(path, "mast3r" if kind == "mast3r" else "dust3r")
+    assert found["shapes"][0].endswith("5 descriptors" if kind == "mast3r" else "no descriptors")
+    assert "encoder 64 x 1, decoder 64 x 1" in found["shapes"][0]
+    assert found["shapes"][1] and found["values"][1] and found["confidence"][1]
+    assert not found["depth"][1]
+    assert ("units of its own" in found["depth"][0]) == (kind == "linear")
+    assert ("descriptors" in found) == (kind == "mast3r")
+
+
+def test_check_believes_what_can_be_true(tmp_path: Path) -> None:
+    """Every pixel 2 m ahead and surely so; only its likeness with the room gives it away."""
+    network, path = TwoView(PLAUSIBLE["linear"]), tmp_path / "mine.safetensors"
+    for head in (network.downstream_head1, network.downstream_head2):
+        head.proj.weight.data.zero_()
+        head.proj.bias.data = torch.tensor([0.0, 0.0, 1.0, 1.0]).repeat_interleave(256)
+    save_file(network.state_dict(), path)
+    found = check(path, "dust3r")
+    assert [name for name, (_, good) in found.items() if not good] == ["likeness"]
+    assert found["depth"][0].startswith("1.72 .. 1.72 .. 1.72")
+    assert found["confidence"][0] == "at least 3.72, 3.72 in the median"
 
 
 @pytest.mark.gpu

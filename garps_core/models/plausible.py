@@ -24,6 +24,10 @@ Picture = npt.NDArray[np.uint8]
 
 LOW_M = 0.2
 """No depth network for rooms or streets says less of a whole room."""
+HIGH_M = 20.0
+"""Nor does any two-view network say more, in the median."""
+SHIFT_PX = 16
+"""Between the two views that a two-view network is shown."""
 SATURATED = 0.98
 """Share of the largest depth beyond which nearly every pixel of a relative model's output lies."""
 
@@ -52,6 +56,8 @@ def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Ite
         yield from _depth_anything(path, found, range_of(path.name, found.metadata, variant, "--variant"))
     elif told == "flash3d":
         yield from _flash3d(found)
+    elif told in ("mast3r", "dust3r"):
+        yield from _two_view(found, known.variant if known else found.metadata.get("variant", ""))
     elif told == "dinov2":
         yield from _dinov2(found)
     elif told == "m2f":
@@ -91,16 +97,60 @@ def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Fi
     low, median, high = (float(x) for x in np.percentile(depth, (5, 50, 95)))
     words = f"{low:.2f} .. {median:.2f} .. {high:.2f} m (5, 50, 95 %)"
     yield "depth", words, low >= LOW_M and high <= SATURATED * max_depth
-    logs = np.log(np.maximum(depth.ravel(), 1e-6)), np.log(true.ravel())
-    likeness = float(np.corrcoef(*logs)[0, 1]) if logs[0].std() > 1e-5 else 0.0
-    words = f"correlation {likeness:.2f} with the drawn room, {np.median(true):.2f} m deep in the median"
-    yield "likeness", words, likeness > 0
+    likeness = _likeness(depth, true)
+    yield _likeness_finding(likeness, true)
     if likeness < -0.3 or median > SATURATED * max_depth:
         yield (
             "relative?",
             "near and far exchanged, or all as far as can be: probably the file of a relative model",
             False,
         )
+
+
+def _likeness(depth: Float32Array, true: Float32Array) -> float:
+    """Correlation of the logarithms."""
+    logs = np.log(np.maximum(depth.ravel(), 1e-6)), np.log(true.ravel())
+    return float(np.corrcoef(*logs)[0, 1]) if logs[0].std() > 1e-5 else 0.0
+
+
+def _likeness_finding(likeness: float, true: Float32Array) -> Finding:
+    words = f"correlation {likeness:.2f} with the drawn room, {np.median(true):.2f} m deep in the median"
+    return "likeness", words, likeness > 0
+
+
+def _two_view(found: Tensors, variant: str) -> Iterator[Finding]:
+    """From a part of the drawn room and another that is SHIFT_PX further right and down."""
+    from garps_core.models.naver import NaverModel
+    from garps_core.models.two_view import built_from
+
+    model = NaverModel(built_from(found.tensors), variant)
+    sizes = model.network.architecture
+    stacks = (f"{name} {stack.width} x {stack.blocks}" for name, stack in vars(sizes).items() if name.endswith("coder"))
+    yield "shapes", f"{sizes.name}, {', '.join(stacks)}, {sizes.descriptors or 'no'} descriptors", True
+    picture, room = drawn_room(240 + SHIFT_PX, 320 + SHIFT_PX)
+    maps = model(picture[:240, :320].copy(), picture[SHIFT_PX:, SHIFT_PX:].copy())
+    seen, framing = maps.source_first[0], maps.framings[0]
+    depth, unit = seen.points[..., 2], "m" if maps.metric else "units of its own"
+    low, median, high = (float(x) for x in np.percentile(depth, (5, 50, 95)))
+    words = f"{low:.2f} .. {median:.2f} .. {high:.2f} {unit} (5, 50, 95 %)"
+    yield "depth", words, LOW_M <= median <= HIGH_M if maps.metric else median > 0
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    u, v = framing.to_image(np.stack([x.ravel(), y.ravel()], -1)).round().astype(int).clip(0, (319, 239)).T
+    yield _likeness_finding(_likeness(depth, room[v, u]), room[v, u])
+    least, middle = float(seen.confidence.min()), float(np.median(seen.confidence))
+    yield "confidence", f"at least {least:.2f}, {middle:.2f} in the median", least >= 1 and middle > 1
+    if maps.source_first[1].descriptors is not None and seen.descriptors is not None:
+        yield _descriptors(seen.descriptors, maps.source_first[1].descriptors, framing.scale)
+
+
+def _descriptors(first: Float32Array, second: Float32Array, scale: tuple[float, float]) -> Finding:
+    """Are they unit vectors, and more alike where both views see the same?"""
+    right, down = (round(SHIFT_PX * factor) for factor in scale)
+    one, two = first[down:, right:], second[:-down, :-right]
+    off = max(float(np.abs(np.linalg.norm(part, axis=-1) - 1).max()) for part in (one, two))
+    same, others = (float((one * part).sum(-1).mean()) for part in (two, two[::-1, ::-1]))
+    words = f"length 1 to {off:.0e}; likeness {same:.2f} where both views see the same, {others:.2f} elsewhere"
+    return "descriptors", words, off < 1e-3 and same > others
 
 
 def _flash3d(found: Tensors) -> Iterator[Finding]:
