@@ -15,10 +15,20 @@ from golden_rule import chw, compare, image, keys, unit
 from network_weights import TWO_VIEW, two_view_architecture, two_view_tensors, with_aliases
 from safetensors.torch import save_file
 
+from bench.two_view import counted, measured, random_network, stages
 from garps_core.errors import InputError, WeightsError
 from garps_core.models.convert import needed
 from garps_core.models.files import read_tensors
-from garps_core.models.two_view import Architecture, Stack, TwoView, architecture_of, built_from, rotated, rotation
+from garps_core.models.two_view import (
+    Architecture,
+    CrossAttention,
+    Stack,
+    TwoView,
+    architecture_of,
+    built_from,
+    rotated,
+    rotation,
+)
 
 MAST3R, DPT, LINEAR = TWO_VIEW
 FULL = "mast3r_full"
@@ -208,6 +218,27 @@ def test_views_of_different_sizes_meet(networks: dict[str, TwoView]) -> None:
     assert (one.points - other.points).abs().max() > 1e-3
 
 
+def test_every_view_is_turned_by_its_own_places(networks: dict[str, TwoView]) -> None:
+    """Of views of different sizes: queries by those of the view that looks, keys by those of the one looked at."""
+    torch.manual_seed(0)
+    look, x, other = CrossAttention(64, 1), torch.randn(1, 6, 64), torch.randn(1, 8, 64)
+    turn, other_turn = rotation((2, 3), 64), rotation((4, 2), 64)
+    q, k = rotated(look.projq(x)[:, None], turn)[0, 0], rotated(look.projk(other)[:, None], other_turn)[0, 0]
+    expected = look.proj((q @ k.T / 8).softmax(-1) @ look.projv(other))
+    torch.testing.assert_close(look(x, other, turn, other_turn), expected, rtol=1e-5, atol=1e-6)
+    network, given = networks[LINEAR], []
+    blocks = network.dec_blocks[1], network.dec_blocks2[1]
+    hooks = [block.register_forward_pre_hook(lambda _, args: given.append(args)) for block in blocks]
+    with torch.inference_mode():
+        network.decode(torch.randn(1, 6, 128), (2, 3), torch.randn(1, 8, 128), (4, 2))
+    for hook in hooks:
+        hook.remove()
+    width = 96 // 3
+    for args, own, others in zip(given, ((2, 3), (4, 2)), ((4, 2), (2, 3)), strict=True):
+        assert [len(tokens[0]) for tokens in args[:2]] == [own[0] * own[1], others[0] * others[1]]
+        assert torch.equal(args[2][0], rotation(own, width)[0]) and torch.equal(args[3][0], rotation(others, width)[0])
+
+
 def test_other_sides_are_refused(networks: dict[str, TwoView]) -> None:
     with pytest.raises(InputError, match=r"100x128 pixels \(rows x columns\): expected multiples of 16"):
         networks[MAST3R].encode(torch.zeros(1, 3, 100, 128))
@@ -294,6 +325,20 @@ def test_the_descriptors_are_counted_in_the_file() -> None:
         tokens = built.encode(torch.zeros(1, 3, 16, 32))
         maps, _ = built.decode(tokens, (1, 2), tokens, (1, 2))
     assert maps.descriptors is not None and maps.descriptors.shape == (1, 16, 32, 3)
+
+
+def test_the_benchmark_runs_what_garps_runs() -> None:
+    """Its stages are those of a pair, on a network whose random output is finite."""
+    network = random_network(Architecture(Stack(64, 1, 1), Stack(64, 1, 1), linear=True))
+    found = {}
+    with torch.inference_mode():
+        for name, call in stages(network, [image(60, 80), image(60, 80, 9)]).items():
+            row = counted(measured(name, call, runs=1), call)
+            found[name] = row["GFLOP"]
+            assert row["CPU s"] >= 0 and row["peak MiB"] > 0
+    prepare, encode, decode, heads, whole = found.values()
+    assert prepare == 0 < heads < decode
+    assert whole == pytest.approx(encode + decode)
 
 
 @pytest.mark.skipif(os.environ.get("GARPS_LARGE_TESTS") != "1", reason="GARPS_LARGE_TESTS=1: 6 GB and minutes")
