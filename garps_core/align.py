@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import ContextDecorator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -51,7 +52,22 @@ def estimate_with_mixtures(
     source: View, target: View, config: Config | None = None, prior: Prior | None = None
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
-    config = config or Config()
+    config = _doubting(config or Config(), source.K_estimated or target.K_estimated)
+    estimate, mixtures = _estimated(source, target, config, prior)
+    focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
+    return replace(estimate, estimated_fx_px=(focal[0], focal[1])), mixtures
+
+
+def _doubting(config: Config, intrinsics: bool) -> Config:
+    """With more doubt about the shape of both depth maps where intrinsics are estimates: that is what they warp."""
+    sigmas = {"lifting.scale_sigma": config.lifting.scale_sigma, "lifting.warp_sigma": config.lifting.warp_sigma}
+    wider = {name: float(np.hypot(sigma, config.start.focal_sigma)) for name, sigma in sigmas.items()}
+    return config.replace(wider) if intrinsics else config
+
+
+def _estimated(
+    source: View, target: View, config: Config, prior: Prior | None
+) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     checked_device(config.device)
     spent, begin = {}, time.perf_counter()
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.config import METHODS, PRESETS, Config, Reconstruction
+from garps_core.config import METHODS, PRESETS, STARTS, TWO_VIEW, Config, Reconstruction
 from garps_core.errors import GarpsError, InputError
-from garps_core.files import read_view
+from garps_core.files import read_image, read_view
+from garps_core.focal import estimate_intrinsics
 from garps_core.initialise import identity
 from garps_core.pairing import checked_device
 from garps_core.report import as_json, as_text
@@ -32,7 +32,6 @@ from garps_core.weights_cli import app as weights_app
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
-Estimator = Callable[[Config, Prior | None], tuple[PoseEstimate, tuple[Mixture, Mixture] | None]]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
     add_completion=False,
@@ -78,9 +77,7 @@ def _root(
 def align(
     source: Annotated[Path, typer.Argument(help="Image of the source camera, or splats (.ply).", metavar="SRC")],
     target: Annotated[Path, typer.Argument(help="Image of the target camera, or splats (.ply).", metavar="TGT")],
-    K: Annotated[
-        Four | None, typer.Option("--K", help="Pinhole intrinsics in pixels, of images.", metavar="FX FY CX CY")
-    ] = None,
+    K: Annotated[Four | None, typer.Option("--K", help="Intrinsics of images, px.", metavar="FX FY CX CY")] = None,
     K_target: Annotated[
         Four | None, typer.Option("--K-target", help="Of the target, if different.", metavar="FX FY CX CY")
     ] = None,
@@ -98,11 +95,10 @@ def align(
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; without depth monocular]")
+        str | None, typer.Option(help=f"{', '.join(PRESETS)}. [default; without depth monocular]")
     ] = None,
-    reconstruction: Annotated[
-        str | None, typer.Option(help=f"One of {', '.join(METHODS)}. [auto: the depth, else a network's]")
-    ] = None,
+    reconstruction: Annotated[str | None, typer.Option(help=f"{', '.join(METHODS)}. [auto]")] = None,
+    start: Annotated[str | None, typer.Option(help=f"Initial pose: {', '.join(STARTS)}. [auto]")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
@@ -113,24 +109,27 @@ def align(
 ) -> int:
     """Pose of the source camera in the target camera's frame, metric, with covariance.
 
-    Points of the source go to the target as x_target = R x_source + t, in metres; optical frames: x right, y down,
-    z forward. Prints translation, rotation, their sigmas and how far to trust them.
+    Points of the source go to the target as x_target = R x_source + t, m; optical frames: x right, y down, z forward.
 
     \b
     Example:
       garps align a.png b.png --K 525 525 319.5 239.5 \\
           --depth-source a_depth.png --depth-target b_depth.png --figure pair.png
       garps align a.png b.png --K 525 525 319.5 239.5        # by a network, see `garps weights`
+      garps align a.png b.png --preset mast3r                # nothing else is known
       garps align a.ply b.ply --prior "0.2 0 0 0 0 0 1"      # splats of any producer, metres
     \b
     Exit code: 0 = converged, 1 = no pose to be trusted (the reason is printed), 2 = wrong input.
     """
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
-    splats, start = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
+    splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     preset = preset or ("default" if splats or any(depths) else "monocular")
-    config = _configured(preset, set_ or [], device, reconstruction)
-    found = _of_splats(files, config, any(depths + Ks)) if splats else _of_views(_views(files, depths, Ks, depth_scale))
-    estimate, mixtures = found(config, start)
+    options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
+    config = _configured(preset, set_ or [], options)
+    if splats:
+        estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
+    else:
+        estimate, mixtures = estimate_with_mixtures(*_views(files, depths, Ks, depth_scale, config), config, given)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
     _write_extras(estimate, mixtures, figure, ply)
     return 0 if estimate.ok else 1
@@ -161,7 +160,9 @@ def _are_splats(files: tuple[Path, Path], method: str | None) -> bool:
     return all(splats)
 
 
-def _of_splats(files: tuple[Path, Path], config: Config, of_images: bool) -> Estimator:
+def _of_splats(
+    files: tuple[Path, Path], config: Config, start: Prior | None, of_images: bool
+) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     asked = replace(config.reconstruction, method="ply") != Reconstruction(method="ply")
     if of_images or asked or config.reconstruction.method not in ("auto", "ply"):
         raise InputError(
@@ -170,26 +171,40 @@ def _of_splats(files: tuple[Path, Path], config: Config, of_images: bool) -> Est
         )
 
     x, y = (read_splats(file) for file in files)
-    return lambda config, start: (align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y))
-
-
-def _of_views(views: tuple[View, View]) -> Estimator:
-    return lambda config, start: estimate_with_mixtures(*views, config, start)
+    return align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y)
 
 
 def _views(
-    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], Ks: tuple[Four | None, Four | None], scale: Any
+    files: tuple[Path, Path],
+    depths: tuple[Path | None, Path | None],
+    Ks: tuple[Four | None, Four | None],
+    scale: Any,
+    config: Config,
 ) -> tuple[View, View]:
     if Ks[0] is None:
-        raise InputError("--K is missing: expected FX FY CX CY in pixels, from the camera's calibration")
+        return _uncalibrated(files, depths, scale, config)
     of_source, of_target = _intrinsics("--K", Ks[0]), _intrinsics("--K-target", Ks[1] or Ks[0])
     return read_view(files[0], of_source, depths[0], scale), read_view(files[1], of_target, depths[1], scale)
 
 
-def _configured(preset: str, changes: list[str], device: str | None, method: str | None) -> Config:
-    config = changed_config(Config.preset(preset), changes)
-    config = config if method is None else config.replace({"reconstruction.method": method})
-    config = config if device is None else config.replace({"device": device})
+def _uncalibrated(
+    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], scale: Any, config: Config
+) -> tuple[View, View]:
+    if config.start.method not in TWO_VIEW:
+        raise InputError(
+            "--K is missing: expected FX FY CX CY in pixels, from the camera's calibration; or a two-view network that "
+            f"can estimate it, --start {' or '.join(TWO_VIEW)}"
+        )
+    K_source, K_target = estimate_intrinsics(read_image(files[0]), read_image(files[1]), config)
+    source, target = (
+        read_view(*given, scale, K_estimated=True) for given in zip(files, (K_source, K_target), depths, strict=True)
+    )
+    return source, target
+
+
+def _configured(preset: str, changes: list[str], options: dict[str, str | None]) -> Config:
+    given = {name: value for name, value in options.items() if value is not None}
+    config = changed_config(Config.preset(preset), changes).replace(given)
     checked_device(config.device)
     return config
 

@@ -18,6 +18,8 @@ __all__ = [
     "METHODS",
     "PRESETS",
     "SCENES",
+    "STARTS",
+    "TWO_VIEW",
     "Alignment",
     "Config",
     "Lifting",
@@ -26,7 +28,10 @@ __all__ = [
     "Start",
 ]
 
-METHODS = ("auto", "rgbd", "depth_anything_v2", "flash3d", "ply")
+METHODS = ("auto", "rgbd", "depth_anything_v2", "flash3d", "two_view", "ply")
+TWO_VIEW = ("mast3r", "dust3r", "adapter")
+"""Starts by a two-view network."""
+STARTS = ("auto", "features", "identity", *TWO_VIEW)
 SCENES = ("any", "indoor", "outdoor")
 
 
@@ -36,7 +41,8 @@ class Reconstruction(Checked):
 
     method: str = setting(
         "auto",
-        "rgbd = the sensor's depth; a network; ply = mixtures from files; auto = depth_anything_v2 without a sensor",
+        "rgbd = the sensor's depth; a network; two_view = that of start.method, which then runs once for both; ply = "
+        "mixtures from files; auto = depth_anything_v2 without a sensor",
         choices=METHODS,
         live=False,
     )
@@ -107,9 +113,29 @@ class Start(Checked):
 
     method: str = setting(
         "auto",
-        "auto = the given prior and features together, or the one there is, else identity when `identity_fallback`",
-        choices=("auto", "features", "identity"),
+        "auto = the given prior and features together, or the one there is, else identity when `identity_fallback`; "
+        "mast3r, dust3r, adapter = a two-view network, and the prior",
+        choices=STARTS,
+        live=False,
     )
+    weights: str = setting(
+        "", "of mast3r, dust3r or the adapter: a name or a file; empty = the first installed", live=False
+    )
+    adapter: str = setting("", "name of an installed two-view adapter (docs/two_view_models.md)", live=False)
+    pose_from: str = setting(
+        "maps", "a two-view network's point maps, or matches of its descriptors", choices=("maps", "matches")
+    )
+    scale: str = setting(
+        "auto",
+        "whose metres a two-view network's pose gets: its own, or the depth's; auto = its own if it has any",
+        choices=("auto", "network", "depth"),
+    )
+    min_confidence: float = setting(
+        3.0, "points of which a two-view network is less sure are not used", unit="", low=0, high=1e6
+    )
+    network_scale_sigma: float = setting(0.1, "relative error of a two-view network's metre", low=0, high=1)
+    network_warp_sigma: float = setting(0.02, "relative smooth warp of a two-view network's points", low=0, high=1)
+    focal_sigma: float = setting(0.05, "relative error of a focal length that a network has estimated", low=0, high=1)
     features: bool = setting(True, "match features also where a prior is given: they check and sharpen it")
     max_contradiction: float = setting(
         5.0, "given prior and features further apart than this are two rivals", unit="sigma", low=1, high=1e6
@@ -205,6 +231,18 @@ def _paper() -> Config:
     )
 
 
+def _paper_full() -> Config:
+    """The published pipeline whole: MASt3R, Flash3D on Depth Anything V2, labels of Mask2Former. For research only."""
+    return _paper().replace(
+        {"start.method": "mast3r", "reconstruction.method": "flash3d", "reconstruction.semantics": "m2f"}
+    )
+
+
+def _mast3r() -> Config:
+    """Two images and nothing else: MASt3R gives the initial pose and both depth maps in one pass. Non-commercial."""
+    return _monocular().replace({"start.method": "mast3r", "reconstruction.method": "two_view"})
+
+
 PRESETS: dict[str, Callable[[], Config]] = {
     "default": Config,
     "sensor": Config,
@@ -212,6 +250,8 @@ PRESETS: dict[str, Callable[[], Config]] = {
     "structured_light": _structured_light,
     "stereo": _stereo,
     "monocular": _monocular,
+    "mast3r": _mast3r,
     "paper": _paper,
+    "paper_full": _paper_full,
 }
 """What `Config.preset` knows; "default" and "sensor" are one and the same."""

@@ -40,7 +40,7 @@ def match_features(source: View, target: View, start: Start) -> Matches:
     with ThreadPoolExecutor(2) as pool:
         (px_s, descriptors_s), (px_t, descriptors_t) = pool.map(_describe, (source.rgb, target.rgb), (count, count))
     i, j = _mutual(descriptors_s, descriptors_t, start.match_ratio)
-    return Matches(px_s[i], px_t[j], _points(source, px_s[i]), _points(target, px_t[j]))
+    return Matches(px_s[i], px_t[j], points_at(source, px_s[i]), points_at(target, px_t[j]))
 
 
 def _describe(rgb: npt.NDArray[np.uint8], count: int) -> tuple[Array, npt.NDArray[np.float32]]:
@@ -68,8 +68,8 @@ def _mutual(
     return pairs[:, 0], pairs[:, 1]
 
 
-def _points(view: View, px: Array) -> Array:
-    """3D points (n, 3) m of pixels (n, 2); NaN without trustworthy depth."""
+def points_at(view: View, px: Array) -> Array:
+    """3D points (n, 3) m of a view's pixels (n, 2); NaN without trustworthy depth."""
     if view.depth is None or len(px) == 0:
         return np.full((len(px), 3), np.nan)
     height, width = view.depth.shape

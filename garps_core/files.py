@@ -17,7 +17,13 @@ from garps_core.types import MAX_IMAGE_PIXELS, View
 MILLIMETRE = 0.001
 
 
-def read_view(image: Path, K: Float64Array, depth: Path | None = None, depth_scale: float | None = None) -> View:
+def read_view(
+    image: Path,
+    K: Float64Array,
+    depth: Path | None = None,
+    depth_scale: float | None = None,
+    K_estimated: bool = False,
+) -> View:
     """Read a colour image and, when given, its registered depth.
 
     Args:
@@ -25,13 +31,14 @@ def read_view(image: Path, K: Float64Array, depth: Path | None = None, depth_sca
         K: 3x3 pixels.
         depth: see `read_depth`.
         depth_scale: metres per unit of the depth file; None = 0.001 for integers, 1 for floats.
+        K_estimated: K is a network's estimate.
     Raises:
         InputError: a file that is missing, no image, or does not fit the other; names the file.
     """
     rgb = read_image(image)
     metres = None if depth is None else read_depth(depth, depth_scale)
     try:
-        return View(rgb=rgb, K=K, depth=metres, frame_id=image.stem)
+        return View(rgb=rgb, K=K, depth=metres, frame_id=image.stem, K_estimated=K_estimated)
     except InputError as error:
         raise InputError(f"{image}{f' with {depth}' if depth else ''}: {error}") from None
 

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial poses, always with a covariance: a given prior and features as two measurements of one pose, or identity."""
+"""Initial poses, always with a covariance: a given prior and features, or a two-view network, as two measurements of
+one pose; or identity."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from garps_core.config import Config
-from garps_core.errors import InitialisationError
+from garps_core.config import TWO_VIEW, Config
+from garps_core.descriptors import match_descriptors
+from garps_core.errors import InitialisationError, ModelError, WeightsError
 from garps_core.features import match_features
 from garps_core.geometry import se3_exp, se3_inverse, se3_log
+from garps_core.map_pose import pose_from_maps
 from garps_core.pnp import pose_from_matches
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist, twist_from_ros
@@ -22,13 +25,19 @@ def initialise(
     "auto" takes what a given prior and features say together; features alone; a prior alone (also where
     `start.features` is off); or identity if `start.identity_fallback`. Prior and features that contradict each other
     are two initial poses: the alignment has to tell which is right. "features" and "identity" do as they say and ignore
-    a prior.
+    a prior. A two-view network's pose is put together with a given prior as that of features is under "auto".
 
     Raises:
-        InitialisationError: features fail and identity is not allowed.
+        InitialisationError: features fail and identity is not allowed; or the two-view network fails, has too little
+            memory, or computes what is not finite.
+        WeightsError: the two-view network's weights are missing, or not what they should be.
+        ConfigError: no such adapter, or metres from a network that has none.
     """
     config = config or Config()
     method = config.start.method
+    if method in TWO_VIEW:
+        found = _by_network(source, target, config)
+        return (found,) if prior is None else combined(prior, found, config.start.max_contradiction)
     if method == "identity":
         return (identity(config, "asked for by start.method"),)
     if method == "auto" and prior is not None and not config.start.features:
@@ -44,8 +53,28 @@ def initialise(
     return (found,) if prior is None or method == "features" else combined(prior, found, config.start.max_contradiction)
 
 
+def _by_network(source: View, target: View, config: Config) -> Prior:
+    from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
+
+    try:
+        maps = pair_maps(source.rgb, target.rgb, config)
+    except WeightsError:
+        raise
+    except ModelError as failure:
+        raise InitialisationError(f"{config.start.method}: {failure}") from None
+    if config.start.pose_from == "maps":
+        return pose_from_maps(maps, source, target, config)
+    matches = match_descriptors(maps, source, target, config)
+    if maps.gives_metres(config.start.scale):
+        errors = {"scale": config.start.network_scale_sigma, "warp": config.start.network_warp_sigma}
+        config = config.replace({f"lifting.{name}_sigma": sigma for name, sigma in errors.items()})
+    return pose_from_matches(matches, source, target, config, maps.origin)
+
+
 def combined(given: Prior, features: Prior, max_contradiction: float) -> tuple[Prior, ...]:
     """The pose that two measurements agree on, or both of them, features first, when they contradict each other.
+
+    What is said of features here goes for a two-view network, too.
 
     They contradict when their difference, log(T_given T_features^-1), is more than `max_contradiction` sigmas long
     under the sum of their covariances. Otherwise the difference is shared out by the two covariances (the update of
@@ -60,7 +89,7 @@ def combined(given: Prior, features: Prior, max_contradiction: float) -> tuple[P
         reason = f"contradicts the {{}}: {sigmas:.1f} sigmas apart ({max_contradiction:g} allowed)"
         return (
             Prior(T, features.covariance, features.origin, f"{features.reason}; {reason.format('given prior')}"),
-            Prior(given.T_target_source, given.covariance, given.origin, reason.format("features")),
+            Prior(given.T_target_source, given.covariance, given.origin, reason.format(features.origin)),
         )
     gain = of_features @ np.linalg.inv(of_given + of_features)
     T = np.asarray(se3_exp(np.asarray(gain @ difference, np.float64)) @ T, np.float64)

@@ -44,38 +44,40 @@ class OneWay:
     K: Array
 
 
-def pose_from_matches(matches: Matches, source: View, target: View, config: Config) -> Prior:
+def pose_from_matches(matches: Matches, source: View, target: View, config: Config, origin: str = "features") -> Prior:
     """Pose with covariance from matches with depth. Raises InitialisationError with the counts when it cannot."""
     has_s, has_t = (np.isfinite(p[:, 0]) for p in (matches.source_points, matches.target_points))
     forward = OneWay(matches.source_points[has_s], matches.target_px[has_s], target.K)
     backward = OneWay(matches.target_points[has_t], matches.source_px[has_t], source.K)
+    need, threshold = config.start.min_inliers, config.start.ransac_px
     candidates = [
         pose
-        for pose in (_ransac(forward, target, config), _inverse(_ransac(backward, source, config)))
+        for pose in (ransac(forward, threshold, config), _inverse(ransac(backward, threshold, config)))
         if pose is not None
     ]
-    need, threshold = config.start.min_inliers, config.start.ransac_px
-    scored = [(_inliers(forward, T, threshold), _inliers(backward, se3_inverse(T), threshold), T) for T in candidates]
+    scored = [
+        (inliers_of(forward, T, threshold), inliers_of(backward, se3_inverse(T), threshold), T) for T in candidates
+    ]
     if not scored:
         raise InitialisationError(f"{len(matches)} feature matches, {has_s.sum()} with depth: no pose fits them")
     inlier_f, inlier_b, T = max(scored, key=lambda s: int(s[0].sum() + s[1].sum()))
     count = int(max(inlier_f.sum(), inlier_b.sum()))
     if count < need:
         raise InitialisationError(f"{len(matches)} feature matches, {count} fit one pose: expected at least {need}")
-    ways = (_keep(forward, inlier_f), _keep(backward, inlier_b))
+    ways = (keep(forward, inlier_f), keep(backward, inlier_b))
     T, covariance = _refine(T, *ways, config)
     reason = f"{len(matches)} feature matches, {count} inliers"
-    return Prior(T, covariance, "features", reason)
+    return Prior(T, covariance, origin, reason)
 
 
-def _ransac(way: OneWay, seen_by: View, config: Config) -> Array | None:
-    """Pose that maps way.points into the camera that saw way.px; None when there is none."""
+def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) -> Array | None:
+    """Pose that maps way.points into the camera that saw way.px, after `least` trials at least; None if there is none."""
     if len(way.points) < max(4, config.start.min_inliers):
         return None
-    height, width = seen_by.rgb.shape[:2]
     parameters = [way.K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    camera = {"model": "PINHOLE", "width": width, "height": height, "params": parameters}
-    options = {"max_reproj_error": config.start.ransac_px, "seed": config.seed, "max_iterations": 10_000}
+    camera = {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}  # the size is of no use to it
+    trials = {"min_iterations": least, "max_iterations": 10_000, "seed": config.seed}
+    options = {"max_reproj_error": threshold_px, **trials}
     pose, info = poselib.estimate_absolute_pose(way.px, way.points, camera, options, {})
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = pose.R, pose.t
@@ -86,31 +88,46 @@ def _inverse(T: Array | None) -> Array | None:
     return None if T is None else se3_inverse(T)
 
 
-def _inliers(way: OneWay, T: Array, threshold_px: float) -> Bool:
+def inliers_of(way: OneWay, T: Array, threshold_px: float) -> Bool:
+    """Which of the way's points T brings in front of the camera and within so many pixels of where it saw them."""
     moved = transform(T, way.points)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.linalg.norm(project(way.K, moved) - way.px, axis=-1)
     return np.asarray((moved[:, 2] > 0.01) & (error < threshold_px))
 
 
-def _keep(way: OneWay, mask: Bool) -> OneWay:
+def keep(way: OneWay, mask: Bool) -> OneWay:
+    """The matches where mask is true."""
     return OneWay(way.points[mask], way.px[mask], way.K)
 
 
 @dataclass(frozen=True)
-class _Normal:
+class Normal:
     """Normal equations of one direction over the left twist of the pose that moves its points."""
 
-    H: Array
-    b: Array
+    informations: Array
+    """(n, 6, 6) what each match adds to the Hessian `H`."""
+    scores: Array
+    """(n, 6) what each match adds to the gradient `b`."""
     from_points: Array
     """(6, 8) d b per unit of each error that the view which measured the points may share (`systematic.py`)."""
     from_pixels: Array
     """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
     residual_px: Array
 
+    @property
+    def H(self) -> Array:
+        """(6, 6) Gauss-Newton Hessian of half the sum of squares."""
+        return np.asarray(self.informations.sum(0))
 
-def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> _Normal:
+    @property
+    def b(self) -> Array:
+        """(6,) gradient of half the sum of squares."""
+        return np.asarray(self.scores.sum(0))
+
+
+def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
+    """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
     moved = transform(T, way.points)
     x, y, z = moved.T
     residual = project(way.K, moved) - way.px
@@ -129,8 +146,8 @@ def _normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Liftin
     fields = D @ (T[:3, :3] @ shared_errors(way.points))
     pointing = np.zeros((2, 8))
     pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
-    b = (JW @ residual[..., None])[..., 0].sum(0)
-    return _Normal((JW @ J).sum(0), b, (JW @ fields).sum(0), JW.sum(0) @ pointing, residual)
+    scores = (JW @ residual[..., None])[..., 0]
+    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, residual)
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
@@ -152,8 +169,8 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 
 
-def _both(T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config) -> tuple[_Normal, _Normal, Array]:
+def _both(T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config) -> tuple[Normal, Normal, Array]:
     inverse = se3_inverse(T)
-    f = _normal_equations(forward, T, sigma, config.lifting)
-    b = _normal_equations(backward, inverse, sigma, config.lifting)
+    f = normal_equations(forward, T, sigma, config.lifting)
+    b = normal_equations(backward, inverse, sigma, config.lifting)
     return f, b, -adjoint(inverse)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array, Float64Array
+from garps_core.errors import ConfigError
 from garps_core.geometry import Array
 
 Picture = npt.NDArray[np.uint8]
@@ -80,6 +81,12 @@ class PairMaps:
     framings: tuple[Framing, Framing]
     metric: bool
     origin: str
+
+    def gives_metres(self, scale: str) -> bool:
+        """Whether `start.scale` asks for the network's own metres. Raises ConfigError where it has none."""
+        if scale == "network" and not self.metric:
+            raise ConfigError(f"start.scale is network, and {self.origin} has no metres: expected auto or depth")
+        return self.metric and scale != "depth"
 
 
 class TwoViewModel(Protocol):

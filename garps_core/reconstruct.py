@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """View -> Mixture: from the sensor's depth, from a depth network's, or by Flash3D on either.
 
-    view -> with_depth: the sensor's, or Depth Anything V2's of all views in one pass
+    view -> with_depth: the sensor's, Depth Anything V2's of all views in one pass, or that of the two-view network
+            which also gives the initial pose
          -> mixture_of: lifted pixel by pixel, or two Gaussians per pixel by Flash3D; labels where asked for
 
 Which, says `config.reconstruction.method`. Networks are loaded once and stay (`models/loaded.py`).
@@ -13,9 +14,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-from garps_core.config import Config
+from garps_core.checks import Float32Array
+from garps_core.config import TWO_VIEW, Config
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
 from garps_core.lift import lift
+from garps_core.map_pose import own_depth
 from garps_core.types import Mixture, View
 
 
@@ -46,6 +49,9 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     method = config.reconstruction.method
     if method == "ply":
         raise ConfigError("reconstruction.method is ply: expected mixtures from files, as `garps align a.ply b.ply`")
+    if method == "two_view":
+        check_settings(config)
+        return _of_pair(views, config)
     needing = [i for i, view in enumerate(views) if view.depth is None or method == "depth_anything_v2"]
     if not needing or method == "rgbd":
         return list(views)
@@ -60,11 +66,31 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
         raise WeightsError(f"no depth with the image, and none from a network: {error}; or give depth") from None
     found = list(views)
     for i, depth in zip(needing, depths, strict=True):
-        try:
-            found[i] = replace(views[i], depth=depth)
-        except InputError as error:
-            raise ReconstructionError(f"the network's {error}") from None
+        found[i] = _given(views[i], depth)
     return found
+
+
+def _of_pair(views: Sequence[View], config: Config) -> list[View]:
+    from garps_core.models.pairs import pair_maps
+
+    if len(views) != 2:
+        raise ConfigError(
+            f"reconstruction.method is two_view, whose network looks at pairs: expected 2 views, not {len(views)}"
+        )
+    maps = pair_maps(views[0].rgb, views[1].rgb, config)
+    if not maps.metric:
+        raise ConfigError(
+            f"reconstruction.method is two_view and the points of {maps.origin} have no metres: expected mast3r"
+        )
+    depths = own_depth(maps, views[0], views[1], config.start.min_confidence)
+    return [_given(view, depth) for view, depth in zip(views, depths, strict=True)]
+
+
+def _given(view: View, depth: Float32Array) -> View:
+    try:
+        return replace(view, depth=depth)
+    except InputError as error:
+        raise ReconstructionError(f"the network's {error}") from None
 
 
 def mixture_of(view: View, config: Config) -> Mixture:
@@ -97,6 +123,11 @@ def mixtures_of(views: Sequence[View], config: Config) -> list[Mixture]:
 
 def check_settings(config: Config) -> None:
     """Raises ConfigError where depth from a network meets settings for a sensor's; for auto it is a view's fault."""
+    if config.reconstruction.method == "two_view" and config.start.method not in TWO_VIEW:
+        raise ConfigError(
+            f"reconstruction.method is two_view and start.method is {config.start.method}: expected a two-view network "
+            f"to start with, one of {', '.join(TWO_VIEW)}"
+        )
     if config.alignment.depth_errors or config.alignment.solver == "adam":
         return
     if config.reconstruction.method == "auto":

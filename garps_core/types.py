@@ -36,6 +36,7 @@ class View:
         depth: HxW float32 metres along z, registered to rgb; NaN (also 0 and +-Inf) = no reading; None = no depth.
         stamp_ns: time of acquisition, nanoseconds.
         frame_id: name of the optical frame.
+        K_estimated: K is a network's estimate (`focal.estimate_intrinsics`), not a calibration.
     Raises:
         InputError: with what was given, what was expected and what to do.
     """
@@ -45,6 +46,7 @@ class View:
     depth: Float32Array | None = None
     stamp_ns: int = 0
     frame_id: str = ""
+    K_estimated: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", _checked_rgb(self.rgb))
@@ -106,7 +108,7 @@ class Prior:
     Args:
         T_target_source: 4x4 rigid motion, source-camera points into the target camera, metres.
         covariance: 6x6 in the ROS order and meaning (module docstring), m^2 and rad^2.
-        origin: who made it: "given", "features", "given and features", "identity".
+        origin: who made it: "given", "features", "given and features", "identity", or the name of a two-view network.
         reason: why this one was used, for people.
     Raises:
         InputError: no rigid motion, covariance not positive definite.
@@ -157,6 +159,8 @@ class PoseEstimate:
     """How likely the pose is right to 5 cm and 2 deg, 0..1, from its covariance and fit: to gate on and to rank by."""
     agreement: float = float("nan")
     """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
+    estimated_fx_px: tuple[float | None, float | None] = (None, None)
+    """Focal lengths of source and target where they are a network's estimate; None = the intrinsics were given."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: depth (the network's), reconstruct, initialise, align."""
 

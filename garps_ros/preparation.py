@@ -12,12 +12,13 @@ import numpy as np
 
 from garps_core import compiled
 from garps_core.align import estimate_relative_pose
-from garps_core.config import Config, Lifting, Reconstruction, Start
+from garps_core.config import TWO_VIEW, Config, Lifting, Reconstruction, Start
 from garps_core.errors import ConfigError
-from garps_core.reconstruct import check_settings
+from garps_core.reconstruct import check_settings, with_depth
 from garps_core.types import Prior, View
+from garps_ros.tracking import MIN_DEPTH_SHARE
 
-NETWORKS = ("depth_anything_v2", "flash3d")
+NETWORKS = ("depth_anything_v2", "flash3d", "two_view")
 """Methods that ask a network for depth; the others need the sensor's."""
 LONG_S = 2.0
 """Compiled loops that are read from where they were kept take less; more is worth a line."""
@@ -39,8 +40,18 @@ def check_method(config: Config) -> None:
         check_settings(config)
 
 
+def completed(view: View, config: Config) -> View:
+    """A view by itself with what its mixture needs; a two-view network gives nothing before it sees a pair."""
+    return view if config.reconstruction.method == "two_view" else with_depth([view], config)[0]
+
+
+def depth_share(config: Config) -> float:
+    """Share of a view's pixels that must have depth before it sees a pair, for it to begin a trajectory."""
+    return 0.0 if config.reconstruction.method == "two_view" else MIN_DEPTH_SHARE
+
+
 def settings_of_completed(config: Config) -> Config:
-    """The settings for views that already went through `with_depth`: a network's depth then counts as given."""
+    """The settings for views that are `completed` already: a network's depth then counts as given."""
     return config.replace({"reconstruction.method": "rgbd"} if config.reconstruction.method == NETWORKS[0] else {})
 
 
@@ -51,12 +62,24 @@ def scale_from(config: Config) -> str:
     from garps_core.models.store import default  # networks cost nothing where none is used
 
     settings = config.reconstruction
+    if settings.method == "two_view":
+        return f"{two_view_name(config)} of every pair, m"
     variant = "" if settings.scene == "any" else settings.scene
     weights = settings.depth_weights or default("depth_anything", variant).name
     found = f"depth_anything_v2 (weights {weights}), m"
     if settings.method == "flash3d":
         found = f"flash3d (weights {settings.flash3d_weights or default('flash3d').name}) on {found}"
     return found
+
+
+def two_view_name(config: Config) -> str:
+    """The two-view network of the settings, and its weights, in words."""
+    from garps_core.models.store import default
+
+    start = config.start
+    if start.method == "adapter":
+        return f"adapter {start.adapter}"
+    return f"{start.method} (weights {start.weights or default(start.method).name})"
 
 
 def load_networks(config: Config, say: Callable[[str], None]) -> None:
@@ -67,11 +90,17 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
         ModelError: a network that does not fit the memory. ConfigError: the device is not there.
     """
     settings, begin, names = config.reconstruction, time.perf_counter(), []
-    if needs_depth(config) and settings.semantics == "none":
+    two_view = config.start.method in TWO_VIEW
+    if needs_depth(config) and settings.semantics == "none" and not two_view:
         return
     from garps_core.models import loaded  # networks cost nothing where none is used
 
-    if not needs_depth(config):
+    if two_view:
+        from garps_core.models.pairs import two_view_model
+
+        names.append(two_view_name(config))
+        two_view_model(config)
+    if not needs_depth(config) and settings.method != "two_view":
         names.append(scale_from(config).removesuffix(", m"))
         loaded.on_device(loaded.depth_network(settings.depth_weights, settings.scene), config.device)
     if settings.method == "flash3d":

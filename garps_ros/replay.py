@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,6 @@ from rich.progress import Progress
 from garps_core.align import estimate_relative_pose
 from garps_core.config import METHODS, PRESETS, Config
 from garps_core.errors import GarpsError
-from garps_core.reconstruct import with_depth
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
@@ -27,7 +27,14 @@ from garps_ros.cameras import CameraTopics
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.frames import Frames
 from garps_ros.outputs import Outputs
-from garps_ros.preparation import check_method, load_networks, needs_depth, settings_of_completed
+from garps_ros.preparation import (
+    check_method,
+    completed,
+    depth_share,
+    load_networks,
+    needs_depth,
+    settings_of_completed,
+)
 from garps_ros.session import record, stop_on_signals
 from garps_ros.summary import Summary
 from garps_ros.topics import choose_cameras
@@ -159,7 +166,9 @@ def replay(
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
     _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
     config = _configured(preset, reconstruction, set_ or [])
-    rule = KeyframeRule(keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after)
+    rule = KeyframeRule(
+        keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after, depth_share(config)
+    )
     source = CameraTopics(source_image, source_info, source_depth)
     target = CameraTopics(target_image, target_info, target_depth)
     with Bag(bag) as recording:
@@ -234,12 +243,10 @@ def _outcomes(
     def estimate(source: View, target: View) -> PoseEstimate:
         return estimate_relative_pose(source, target, used)
 
-    def completed(view: View) -> View:
-        return with_depth([view], config)[0]
-
     if cameras == 2:
         return estimate_pairs(frames.pairs(), reader, estimate)
-    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule), completed)
+    with_depth = partial(completed, config=config)
+    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule), with_depth)
 
 
 def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:

@@ -18,11 +18,17 @@ from garps_core.align import estimate_with_mixtures
 from garps_core.checks import Float64Array
 from garps_core.config import Config
 from garps_core.geometry import se3_inverse
-from garps_core.reconstruct import with_depth
 from garps_core.types import Mixture, PoseEstimate, Prior, View
 from garps_ros.cameras import Frame
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_pair, failed_outcome, follow_frame, frame_names
-from garps_ros.preparation import load_networks, scale_from, settings_of_completed, warm_up
+from garps_ros.preparation import (
+    completed,
+    depth_share,
+    load_networks,
+    scale_from,
+    settings_of_completed,
+    warm_up,
+)
 from garps_ros.priors import prior_from_message
 from garps_ros.settings import NodeSettings
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
@@ -148,6 +154,7 @@ class Solver:
             settings.keyframe_motion,
             math.radians(settings.keyframe_rotation),
             settings.keyframe_lost_after,
+            depth_share(self._job.config),
         )
         if self._tracker is None or self._epoch != self._job.epoch:
             # Segments are counted on: poses of before and after a reset must not share a frame.
@@ -177,7 +184,7 @@ class Solver:
 
     def _completed(self, view: View) -> View:
         with self._in_stage("depth"):
-            return with_depth([view], self._job.config)[0]
+            return completed(view, self._job.config)
 
     def _estimate(self, source: View, target: View) -> PoseEstimate:
         config = self._job.config

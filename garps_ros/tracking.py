@@ -27,12 +27,14 @@ class KeyframeRule:
         max_motion_m: new keyframe beyond this distance, m.
         max_rotation_rad: new keyframe beyond this rotation, rad.
         lost_after: usable views in a row without a pose after which a new segment begins.
+        min_depth_share: a view with depth at a smaller share of its pixels begins no segment.
     """
 
     min_overlap: float = 0.5
     max_motion_m: float = 0.3
     max_rotation_rad: float = 0.35
     lost_after: int = 5
+    min_depth_share: float = MIN_DEPTH_SHARE
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +94,14 @@ class KeyframeTracker:
             ReconstructionError: the first segment is due, and the view has too little depth for its keyframe.
         """
         share = _depth_share(view)
-        if self._keyframe is None and share < MIN_DEPTH_SHARE:
+        if self._keyframe is None and share < self.rule.min_depth_share:
             raise ReconstructionError(
-                f"the view has depth at {share:.1%} of its pixels: expected at least {MIN_DEPTH_SHARE:.0%} to begin a "
-                "trajectory; uncover the camera, or check the depth topic"
+                f"the view has depth at {share:.1%} of its pixels: expected at least {self.rule.min_depth_share:.0%} "
+                "to begin a trajectory; uncover the camera, or check the depth topic"
             )
         # What was out of sight may be back after a blank view: the keyframe gets one more try.
         patience = self.rule.lost_after + self._was_blank
-        if self._keyframe is not None and (self._failures < patience or share < MIN_DEPTH_SHARE):
+        if self._keyframe is not None and (self._failures < patience or share < self.rule.min_depth_share):
             return False
         self.segment += 1
         self._failures = 0
@@ -113,7 +115,7 @@ class KeyframeTracker:
         Raises what the estimator raises; the view then counts as one without a pose. A view without enough depth to
         begin a segment does not count.
         """
-        self._was_blank = _depth_share(view) < MIN_DEPTH_SHARE
+        self._was_blank = _depth_share(view) < self.rule.min_depth_share
         self._failures += not self._was_blank
         for reference in self._references():
             estimate = self._estimate(view, reference.view)

@@ -85,7 +85,8 @@ def test_what_cannot_change_while_the_node_runs() -> None:
     fixed = {parameter.name for parameter in parameters() if not parameter.live}
     expected = {"preset", "pairing", "image_transport", "depth_transport", "image_qos", "publish_tf"}
     networks = ("method", "depth_weights", "flash3d_weights", "scene", "semantics", "semantic_weights")
-    assert fixed == expected | {f"reconstruction.{name}" for name in (*networks, "semantic_backbone")}
+    expected |= {f"reconstruction.{name}" for name in (*networks, "semantic_backbone")}
+    assert fixed == expected | {f"start.{name}" for name in ("method", "weights", "adapter")}
 
 
 def test_the_groups() -> None:

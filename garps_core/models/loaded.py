@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -20,7 +21,7 @@ from garps_core.models import mask2former, semantics
 from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
 from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
-from garps_core.models.manifest import BY_NAME, named, of_file, range_of
+from garps_core.models.manifest import BY_NAME, PERMISSIVE, licence_of, named, of_file, range_of
 from garps_core.models.store import default, installed, weights_folder
 from garps_core.pairing import checked_device
 from garps_core.types import View
@@ -28,6 +29,8 @@ from garps_core.types import View
 AT_THE_END = 0.98
 """Share of the network's largest depth from which on a pixel is as far as the network can say."""
 
+DTYPE = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+LOG = logging.getLogger("garps_core")
 Made = TypeVar("Made")
 Network = TypeVar("Network", bound=nn.Module)
 _LOCK = threading.RLock()
@@ -73,9 +76,7 @@ def labels(rgb: RGBImage, config: Config) -> IntArray:
 
 def dtype_of(config: Config) -> torch.dtype:
     """What the networks compute in."""
-    return {"float16": torch.float16, "bfloat16": torch.bfloat16}.get(
-        config.reconstruction.network_dtype, torch.float32
-    )
+    return DTYPE[config.reconstruction.network_dtype]
 
 
 def on_device(network: Network, device: str) -> Network:
@@ -104,13 +105,13 @@ def once(load: Callable[..., Made]) -> Callable[..., Made]:
 def depth_network(weights: str, scene: str) -> DepthAnythingV2:
     """Depth Anything V2 from a name, a file or, for "", what is installed; scene = any, indoor or outdoor."""
     variant = "" if scene == "any" else scene
-    path, read = _tensors(weights, "depth_anything", variant)
+    path, read = tensors_of(weights, "depth_anything", variant)
     return built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
 
 
 @once
 def _flash3d(weights: str) -> Flash3D:
-    return flash3d_network(flash3d_tensors(_tensors(weights, "flash3d")[1].tensors)[0])
+    return flash3d_network(flash3d_tensors(tensors_of(weights, "flash3d")[1].tensors)[0])
 
 
 def flash3d(weights: str, device: str) -> Flash3D:
@@ -122,17 +123,28 @@ def flash3d(weights: str, device: str) -> Flash3D:
 def segmenter(kind: str, weights: str, backbone: str) -> semantics.Segmenter | mask2former.Mask2Former:
     """A segmentation of kind linear, ms or m2f from names, files or, for "", what is installed."""
     if kind == "m2f":
-        return mask2former.mask2former_of(_tensors(weights, "m2f")[1].tensors)
-    path, head = _tensors(weights, f"ade20k_{kind}")
+        return mask2former.mask2former_of(tensors_of(weights, "m2f")[1].tensors)
+    path, head = tensors_of(weights, f"ade20k_{kind}")
     known = of_file(path.name)
     if not backbone and known is not None:
         fitting = [one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size]
         backbone = next(filter(installed, fitting), fitting[0])
-    return semantics.segmenter_of(_tensors(backbone, "dinov2")[1].tensors, head.tensors)
+    return semantics.segmenter_of(tensors_of(backbone, "dinov2")[1].tensors, head.tensors)
 
 
-def _tensors(weights: str, kind: str, variant: str = "") -> tuple[Path, Tensors]:
-    """Path and content of weights that are given by name or file; "" = the first that is installed."""
+def tensors_of(weights: str, kind: str, variant: str = "") -> tuple[Path, Tensors]:
+    """Path and content of weights that are given by name or file; "" = the first that is installed.
+
+    Licences that do not permit everything are told to whoever listens to the log.
+    """
+    path, found = _read(weights, kind, variant)
+    licence = licence_of(path.name, found.metadata, kind)
+    if licence not in PERMISSIVE:
+        LOG.warning("licence of the weights %s: %s", path.name, licence)
+    return path, found
+
+
+def _read(weights: str, kind: str, variant: str) -> tuple[Path, Tensors]:
     name = weights or default(kind, variant).name
     if name not in BY_NAME:
         path = Path(weights).expanduser()

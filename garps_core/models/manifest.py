@@ -203,6 +203,15 @@ def of_file(file: str) -> Weights | None:
     return known.get(file)
 
 
+def licence_of(file: str, metadata: Mapping[str, str], kind: str) -> str:
+    """Licence of weights by the name of their file, else by what is stored in it, else the strictest of their kind."""
+    known = of_file(file)
+    if known is not None:
+        return known.licence
+    licences = [weights.licence for weights in ALL if weights.kind == kind]
+    return metadata.get("licence") or next((one for one in licences if one not in PERMISSIVE), licences[0])
+
+
 def range_of(file: str, metadata: Mapping[str, str], variant: str, option: str) -> float:
     """Largest depth (m) of a metric depth network, which its tensors do not tell.
 

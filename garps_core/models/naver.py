@@ -136,7 +136,7 @@ class NaverModel:
 
     def _encoded(self, pictures: Sequence[Picture]) -> list[_Encoded]:
         """Both pictures, those that are not kept from before by the network."""
-        keys = [(_digest(picture), self._device) for picture in pictures]
+        keys = [(digest(picture), self._device) for picture in pictures]
         new = {key: self._prepared(rgb) for key, rgb in zip(keys, pictures, strict=True) if key not in self._kept}
         inputs = [seen for seen, _ in new.values()]
         tokens = self._each(self._encode, inputs, alike=len({seen.shape for seen in inputs}) == 1)
@@ -188,7 +188,7 @@ class NaverModel:
             ) from None
 
 
-def _digest(picture: Picture) -> bytes:
+def digest(picture: Picture) -> bytes:
     """Two pictures share it only if they are equal."""
     return hashlib.blake2b(np.ascontiguousarray(picture).data, key=str(picture.shape).encode()).digest()
 

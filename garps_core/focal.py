@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Intrinsics of a camera nobody has calibrated, from the points that a two-view network gives its pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from garps_core.checks import Float64Array
+from garps_core.config import Config
+from garps_core.errors import InitialisationError
+from garps_core.geometry import Array
+from garps_core.point_maps import Framing, PairMaps, Picture, PointMap
+
+STEPS = 10
+"""Of the reweighted least squares; they converge in five or so."""
+MIN_PIXELS = 100
+
+
+def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tuple[Array, Array]:
+    """3x3 K of two cameras nobody has calibrated, by the two-view network of `config.start`; see `intrinsics_of`.
+
+    Give them to views with `K_estimated=True`, so that the estimate says so and its covariance is wider.
+
+    Args:
+        source, target: HxWx3 uint8 RGB.
+        config: `start.method` must be a two-view network.
+    Raises:
+        InitialisationError: a map has hardly a point in front of its camera.
+        ConfigError, WeightsError, ModelError: as `garps_core.models.pairs.pair_maps`.
+    """
+    from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
+
+    return intrinsics_of(pair_maps(source, target, config), (source.shape[:2], target.shape[:2]))
+
+
+def intrinsics_of(maps: PairMaps, sizes: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[Array, Array]:
+    """3x3 K of source and target, pixel centres at integers: square pixels, principal point in the image's middle.
+
+    Args:
+        maps: of the pair.
+        sizes: (rows, columns) of both images.
+    Raises:
+        InitialisationError: a map has hardly a point in front of its camera.
+    """
+    own = (maps.source_first[0], maps.target_first[0])
+    return _intrinsics(own[0], maps.framings[0], sizes[0]), _intrinsics(own[1], maps.framings[1], sizes[1])
+
+
+def _intrinsics(one: PointMap, framing: Framing, size: tuple[int, ...]) -> Float64Array:
+    height, width = size
+    K = np.array([[1.0, 0.0, (width - 1) / 2], [0.0, 1.0, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    rows, columns = np.nonzero(np.isfinite(one.points).all(-1) & (one.points[..., 2] > 0))
+    if len(rows) < MIN_PIXELS:
+        raise InitialisationError(
+            f"{len(rows)} points lie in front of their camera: expected at least {MIN_PIXELS} to tell its focal "
+            "length from; give the intrinsics"
+        )
+    px = framing.to_image(np.stack([columns, rows], axis=1).astype(np.float64)) - K[:2, 2]
+    points = one.points[rows, columns].astype(np.float64)
+    K[0, 0] = K[1, 1] = focal_length(px, points[:, :2] / points[:, 2:])
+    return K
+
+
+def focal_length(px: Array, slopes: Array) -> float:
+    """f that brings f * slopes (n, 2) nearest to px (n, 2), in the mean of distances, not of squares (Weiszfeld)."""
+    weights = np.ones(len(px))
+    f = 1.0
+    for _ in range(STEPS + 1):
+        f = float((weights * (px * slopes).sum(1)).sum() / max((weights * (slopes**2).sum(1)).sum(), 1e-12))
+        weights = 1 / np.maximum(np.linalg.norm(px - f * slopes, axis=1), 1e-8)
+    return max(f, 1e-3)

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point maps of a pair -> pose with covariance: PnP of one picture's pixels against their points in the other camera.
+
+Each order of the pair gives a pose; the one whose maps are surer of themselves is kept (as the authors of DUSt3R do),
+refined on its inliers. Neighbouring pixels err alike: how much less they are worth than so many independent ones, is
+measured by adding up their residuals in blocks of the picture. The covariance also grows where the two orders
+contradict each other, and gets what all points share: an error of scale and a smooth warp (`systematic.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from garps_core.checks import Float32Array
+from garps_core.config import Config
+from garps_core.errors import InitialisationError
+from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, transform
+from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, OneWay, inliers_of, keep, normal_equations, ransac
+from garps_core.point_maps import Framing, PairMaps, PointMap
+from garps_core.systematic import shared_sigmas
+from garps_core.types import Prior, View
+from garps_core.uncertainty import ros_from_twist
+
+STEP_PX = 4
+"""Every so many pixels of a map, both ways, are used: its neighbours say the same."""
+THRESHOLD_PX = 5.0
+"""Inliers are nearer, in pixels of the map (Wang et al. 2024)."""
+MIN_TRIALS = 50
+"""Of the robust estimate: most pixels of a map that is any good fit."""
+MIN_SHARE = 0.2
+"""Of the trusted pixels that have to fit one pose; a network that fails gives points that fit none."""
+MIN_TRUSTED = 100
+BLOCKS = 6
+"""Blocks along the longer side whose residuals count as independent of each other's."""
+
+Bool = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Order:
+    """One order of the pair: the first camera's frame holds the points, the second one's pixels saw them."""
+
+    views: tuple[View, View]
+    framings: tuple[Framing, Framing]
+    maps: tuple[PointMap, PointMap]
+    trusted: tuple[Bool, Bool]
+    """Of the first's and the second's pixels."""
+
+    @property
+    def score(self) -> float:
+        """How sure the network is of this order."""
+        return float(self.maps[0].confidence.mean() * self.maps[1].confidence.mean())
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """T_second_first, the covariance of its left twist without what all points share, and that for one sigma each."""
+
+    T: Array
+    noise: Array
+    shared: Array
+    reason: str
+
+    def inverted(self) -> _Pose:
+        """Of the pair the other way round."""
+        inverse = se3_inverse(self.T)
+        A = adjoint(inverse)
+        return replace(self, T=inverse, noise=A @ self.noise @ A.T, shared=A @ self.shared @ A.T)
+
+
+def pose_from_maps(maps: PairMaps, source: View, target: View, config: Config) -> Prior:
+    """Initial pose with covariance; `Prior.reason` says which order, how many pixels, and whose metres.
+
+    Args:
+        maps: of source and target.
+        source, target: intrinsics, and where `start.scale` asks for it, depth.
+        config: `start`, `lifting` and `seed` are used.
+    Raises:
+        InitialisationError: too few trusted pixels, or too few that fit one pose, in both orders; no depth to scale by.
+        ConfigError: metres from a network that has none.
+    """
+    orders = _orders(maps, source, target, config.start.min_confidence)
+    by_network = maps.gives_metres(config.start.scale)
+    poses: dict[str, _Pose] = {}
+    failures = []
+    for name, order in orders.items():
+        try:
+            found = _posed(order, by_network, config)
+        except InitialisationError as failure:
+            failures.append(f"{name} first: {failure}")
+            continue
+        poses[name] = found if name == "source" else found.inverted()
+    if not poses:
+        raise InitialisationError(f"{maps.origin}: {'; '.join(failures)}")
+    best = max(poses, key=lambda name: orders[name].score)
+    pose = poses[best]
+    contradiction = _contradiction(*poses.values()) if len(poses) == 2 else 1.0
+    covariance = ros_from_twist(pose.noise * contradiction + pose.shared, pose.T)
+    reason = "; ".join([f"{best} first: {pose.reason}", *failures])
+    if contradiction > 1:
+        reason += f"; the other order contradicts it, sigmas times {np.sqrt(contradiction):.1f}"
+    return Prior(pose.T, covariance, maps.origin, reason)
+
+
+def _orders(maps: PairMaps, source: View, target: View, min_confidence: float) -> dict[str, _Order]:
+    """Both orders; a pixel is trusted where either of its picture's two maps is sure of it."""
+    of_source, of_target = (
+        np.maximum(one.confidence, other.confidence) > min_confidence
+        for one, other in ((maps.source_first[0], maps.target_first[1]), (maps.target_first[0], maps.source_first[1]))
+    )
+    return {
+        "source": _Order((source, target), maps.framings, maps.source_first, (of_source, of_target)),
+        "target": _Order((target, source), maps.framings[::-1], maps.target_first, (of_target, of_source)),
+    }
+
+
+def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
+    way = _second(order)
+    if len(way.points) < MIN_TRUSTED:
+        total = order.trusted[1][::STEP_PX, ::STEP_PX].size
+        raise InitialisationError(
+            f"{len(way.points)} of {total} pixels are surer than {config.start.min_confidence:g}: expected at least "
+            f"{MIN_TRUSTED}; do the pictures share anything, are the weights trained?"
+        )
+    unit = float(np.median(np.linalg.norm(way.points, axis=1)))  # a network without metres may have any unit
+    T = ransac(replace(way, points=way.points / unit), THRESHOLD_PX, config, MIN_TRIALS)
+    count = 0
+    if T is not None:
+        T[:3, 3] *= unit
+        fitting = inliers_of(way, T, THRESHOLD_PX)
+        count = int(fitting.sum())
+    if T is None or count < MIN_SHARE * len(way.points):
+        raise InitialisationError(
+            f"{count} of {len(way.points)} trusted pixels fit one pose: expected at least {MIN_SHARE:.0%}"
+        )
+    scale, scale_sigma, whose = _scale(order, T, by_network, config)
+    T[:3, 3] *= scale
+    fitted = replace(keep(way, fitting), points=way.points[fitting] * scale)
+    T, noise, shared = _refined(T, fitted, scale_sigma, config)
+    return _Pose(T, noise, shared, f"{count} of {len(way.points)} trusted pixels fit; {whose}")
+
+
+def _second(order: _Order) -> OneWay:
+    """The second picture's trusted pixels with their points in the first camera's frame."""
+    rows, columns = _sampled(order.trusted[1])
+    px = np.stack([columns, rows], axis=1).astype(np.float64)
+    K = order.framings[1].intrinsics(order.views[1].K)
+    return OneWay(order.maps[1].points[rows, columns].astype(np.float64), px, K)
+
+
+def _sampled(trusted: Bool) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns of every n-th trusted pixel."""
+    rows, columns = np.nonzero(trusted[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX])
+    return rows * STEP_PX + STEP_PX // 2, columns * STEP_PX + STEP_PX // 2
+
+
+def _scale(order: _Order, T: Array, by_network: bool, config: Config) -> tuple[float, float, str]:
+    """Metres per unit of the maps, its relative sigma, and whose metres they are, in words."""
+    if by_network:
+        return 1.0, config.start.network_scale_sigma, "metres as the network says"
+    ratios = [ratio for k in (0, 1) if (ratio := _depth_ratio(order, k, T)) is not None]
+    if not ratios:
+        raise InitialisationError(
+            "no depth to take the scale from: expected a sensor's or a network's (reconstruction.method), or a metric "
+            "network for the pose"
+        )
+    logs = np.log(ratios)
+    one = np.hypot(config.lifting.scale_sigma, config.lifting.warp_sigma) / np.sqrt(len(ratios))
+    sigma = float(np.hypot(one, np.ptp(logs) / 2))
+    scale = float(np.exp(logs.mean()))
+    return scale, sigma, f"metres by the depth of {len(ratios)} of 2 views, {scale:.3g} per unit of the network"
+
+
+def _depth_ratio(order: _Order, k: int, T: Array) -> float | None:
+    """Median of a view's depth over that of its map, moved into its own camera; None without depth."""
+    depth = order.views[k].depth
+    if depth is None:
+        return None
+    rows, columns = _sampled(order.trusted[k])
+    px = order.framings[k].to_image(np.stack([columns, rows], axis=1).astype(np.float64))
+    u, v = np.rint(px).astype(int).T
+    points = order.maps[k].points[rows, columns].astype(np.float64)
+    z = (transform(T, points) if k else points)[:, 2]
+    metres = depth[v.clip(0, depth.shape[0] - 1), u.clip(0, depth.shape[1] - 1)]
+    usable = np.isfinite(metres) & (z > 0)
+    return float(np.median(metres[usable] / z[usable])) if usable.sum() >= MIN_TRUSTED else None
+
+
+def _refined(T: Array, way: OneWay, scale_sigma: float, config: Config) -> tuple[Array, Array, Array]:
+    """Robust Gauss-Newton; the pose, and as covariances of its left twist the noise and what all points share."""
+    sigma, shared = 1.0, shared_sigmas(config.lifting)
+    shared[0] = scale_sigma
+    shared[1:6] = np.maximum(shared[1:6], config.start.network_warp_sigma)
+    for _ in range(REFINEMENT_STEPS):
+        normal = normal_equations(way, T, sigma, config.lifting)
+        step = -np.linalg.solve(normal.H + 1e-9 * np.eye(6), normal.b)
+        T = se3_exp(np.asarray(step, np.float64)) @ T
+        sigma = max(1.4826 * float(np.median(np.abs(normal.residual_px))), MIN_PIXEL_SIGMA)
+    normal = normal_equations(way, T, sigma, config.lifting)
+    inverse = np.linalg.inv(normal.H + 1e-9 * np.eye(6))
+    alike = max(1.0, float(np.trace(_spread(normal, way.px) @ inverse)) / 6)  # 1 for pixels that err by themselves
+    effect = inverse @ normal.from_points * shared
+    pointing = inverse @ normal.from_pixels * shared_sigmas(config.lifting)
+    return np.asarray(T, np.float64), np.asarray(inverse * alike, np.float64), effect @ effect.T + pointing @ pointing.T
+
+
+def _spread(normal: Normal, px: Array) -> Array:
+    """Sum of g g' over blocks of the picture, g = (1 - H_block H^-1)^-1 b_block: the jackknife's sandwich.
+
+    The factor makes up for what a block takes part in the fit and so hides of its errors (Bell and McCaffrey 2002).
+    """
+    side = (px.max() + 1) / BLOCKS  # a whole covariance from so few sums would be a wild one: its mean is all we take
+    blocks = np.unique(np.floor(px / side).astype(int), axis=0, return_inverse=True)[1].ravel()
+    count = int(blocks.max()) + 1
+    scores, informations = np.zeros((count, 6)), np.zeros((count, 6, 6))
+    np.add.at(scores, blocks, normal.scores)
+    np.add.at(informations, blocks, normal.informations)
+    hidden = informations @ np.linalg.inv(normal.H + 1e-9 * np.eye(6))
+    g = np.linalg.solve(np.eye(6) - hidden, scores[..., None])[..., 0]
+    return np.asarray(g.T @ g * ((count - 1) / count))
+
+
+def _contradiction(one: _Pose, other: _Pose) -> float:
+    """Factor on the noise's covariance that makes the difference of both orders a usual one, at least 1."""
+    difference = se3_log(one.T @ se3_inverse(other.T))
+    apart = float(difference @ np.linalg.solve(one.noise + other.noise, difference))
+    return max(1.0, apart / len(difference))
+
+
+def own_depth(maps: PairMaps, source: View, target: View, min_confidence: float) -> tuple[Float32Array, Float32Array]:
+    """Depth of both views by the maps in their own frames, HxW float32, NaN outside what the network saw and trusted.
+
+    Metres only where `maps.metric`.
+    """
+    orders = _orders(maps, source, target, min_confidence)
+    of_source, of_target = (_depth_of_first(order) for order in orders.values())
+    return of_source, of_target
+
+
+def _depth_of_first(order: _Order) -> Float32Array:
+    framing, z = order.framings[0], order.maps[0].points[..., 2]
+    z = np.where(order.trusted[0] & (z > 0), z, np.float32(np.nan))
+    height, width = order.views[0].rgb.shape[:2]
+    u = (np.arange(width, dtype=np.float32) + 0.5) * framing.scale[0] - framing.offset[0] - 0.5
+    v = (np.arange(height, dtype=np.float32) + 0.5) * framing.scale[1] - framing.offset[1] - 0.5
+    columns, rows = np.meshgrid(u, v)
+    moved = cv2.remap(z, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    return np.asarray(moved, np.float32)

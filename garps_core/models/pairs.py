@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two-view network that is in use: found by name, loaded once, asked once per pair."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from importlib.metadata import entry_points
+
+from garps_core.config import TWO_VIEW, Config
+from garps_core.errors import ConfigError
+from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
+from garps_core.models.manifest import of_file
+from garps_core.models.naver import NaverModel, digest
+from garps_core.models.two_view import built_from
+from garps_core.point_maps import PairMaps, Picture, TwoViewModel
+
+ADAPTERS = "garps_core.two_view"
+"""Entry points of installed packages in this group are adapters: `NAME = "package.module:load"`."""
+
+
+class _Asked:
+    """The pair that was asked about last, and the answer: depth, start pose and intrinsics all want the same."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._answer: tuple[TwoViewModel, bytes, PairMaps] | None = None
+
+    def __call__(self, model: TwoViewModel, source: Picture, target: Picture) -> PairMaps:
+        key = digest(source) + digest(target)
+        with self._lock:
+            if self._answer is None or self._answer[0] is not model or self._answer[1] != key:
+                self._answer = model, key, model(source, target)
+            return self._answer[2]
+
+
+_ASKED = _Asked()
+
+
+def pair_maps(source: Picture, target: Picture, config: Config) -> PairMaps:
+    """What the two-view network of `config.start` says of two pictures HxWx3 uint8 RGB.
+
+    Raises:
+        WeightsError: none installed, or not what they should be.
+        ModelError: too little memory, values that are not finite, or an adapter that fails.
+        ConfigError: no two-view network is chosen, or no adapter of that name is installed.
+    """
+    return _ASKED(two_view_model(config), source, target)
+
+
+def two_view_model(config: Config) -> TwoViewModel:
+    """The network that `config.start.method` names, loaded, on the device. Raises as `pair_maps`."""
+    method = config.start.method
+    if method not in TWO_VIEW:
+        raise ConfigError(f"start.method is {method}: expected a two-view network, one of {', '.join(TWO_VIEW)}")
+    if method == "adapter":
+        return _adapter(config.start.adapter, config.start.weights, config.device)
+    model = _model(method, config.start.weights, config.reconstruction.network_dtype)
+    on_device(model.network, config.device)
+    return model
+
+
+@once
+def _model(kind: str, weights: str, dtype: str) -> NaverModel:
+    path, read = tensors_of(weights, kind)
+    known = of_file(path.name)
+    variant = known.variant if known is not None else read.metadata.get("variant", "")
+    return NaverModel(built_from(read.tensors), variant, DTYPE[dtype])
+
+
+@once
+def _adapter(name: str, weights: str, device: str) -> TwoViewModel:
+    there = {point.name: point for point in entry_points(group=ADAPTERS)}
+    if name not in there:
+        raise ConfigError(
+            f"start.adapter is {name!r}: expected the name of an installed adapter, one of "
+            f"{', '.join(sorted(there)) or 'none there are'}; docs/two_view_models.md shows how to write one"
+        )
+    try:
+        load: Callable[[str, str], TwoViewModel] = there[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"the adapter {name!r} ({there[name].value}) cannot be loaded: {error}") from None
+    return load(weights, device)
