@@ -113,9 +113,19 @@ def _orders(maps: PairMaps, source: View, target: View, min_confidence: float) -
         for one, other in ((maps.source_first[0], maps.target_first[1]), (maps.target_first[0], maps.source_first[1]))
     )
     return {
-        "source": _Order((source, target), maps.framings, maps.source_first, (of_source, of_target)),
-        "target": _Order((target, source), maps.framings[::-1], maps.target_first, (of_target, of_source)),
+        "source": _order((source, target), maps.framings, maps.source_first, (of_source, of_target)),
+        "target": _order((target, source), maps.framings[::-1], maps.target_first, (of_target, of_source)),
     }
+
+
+def _order(
+    views: tuple[View, View],
+    framings: tuple[Framing, Framing],
+    maps: tuple[PointMap, PointMap],
+    trusted: tuple[Bool, Bool],
+) -> _Order:
+    first, second = (np.isfinite(one.points).all(-1) & sure for one, sure in zip(maps, trusted, strict=True))
+    return _Order(views, framings, maps, (first, second))
 
 
 def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:

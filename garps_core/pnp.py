@@ -71,7 +71,7 @@ def pose_from_matches(matches: Matches, source: View, target: View, config: Conf
 
 
 def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) -> Array | None:
-    """Pose that maps way.points into the camera that saw way.px, after `least` trials at least; None if there is none."""
+    """Pose that maps way.points into the camera that saw way.px, after so many trials at least; None without any."""
     if len(way.points) < max(4, config.start.min_inliers):
         return None
     parameters = [way.K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array, Float64Array
-from garps_core.errors import ConfigError
+from garps_core.errors import ConfigError, ModelError
 from garps_core.geometry import Array
 
 Picture = npt.NDArray[np.uint8]
@@ -25,14 +25,25 @@ class PointMap:
 
     Args:
         points: hxwx3 float32, x right, y down, z forward in the frame of the order's first camera; metres if the
-            network is metric.
+            network is metric; NaN where it does not know.
         confidence: hxw float32; the larger, the surer, on the network's own scale.
         descriptors: hxwxC float32 unit vectors that are alike where two pixels see the same, or None.
+    Raises:
+        ModelError: other shapes, or a confidence that is not finite.
     """
 
     points: Float32Array
     confidence: Float32Array
     descriptors: Float32Array | None = None
+
+    def __post_init__(self) -> None:
+        size = self.points.shape[:2]
+        parts = [self.points, self.confidence] + ([] if self.descriptors is None else [self.descriptors])
+        shapes = ", ".join("x".join(map(str, part.shape)) for part in parts)
+        if self.points.shape != (*size, 3) or any(part.shape[:2] != size or part.ndim > 3 for part in parts):
+            raise ModelError(f"a point map has arrays of {shapes}: expected points hxwx3, confidence hxw, of one size")
+        if not np.isfinite(self.confidence).all():
+            raise ModelError("the confidence of a point map is not finite: expected a number for every pixel")
 
 
 @dataclass(frozen=True)
@@ -74,6 +85,8 @@ class PairMaps:
         framings: of source and target.
         metric: whether the network's unit is the metre.
         origin: the network's name.
+    Raises:
+        ModelError: a map of another size than its picture's framing.
     """
 
     source_first: tuple[PointMap, PointMap]
@@ -81,6 +94,13 @@ class PairMaps:
     framings: tuple[Framing, Framing]
     metric: bool
     origin: str
+
+    def __post_init__(self) -> None:
+        wanted = [framing.size for framing in self.framings]
+        for order, sizes in ((self.source_first, wanted), (self.target_first, wanted[::-1])):
+            found = [one.confidence.shape for one in order]
+            if found != [tuple(size) for size in sizes]:
+                raise ModelError(f"{self.origin} gives point maps of {found} pixels: expected {sizes}, its framings'")
 
     def gives_metres(self, scale: str) -> bool:
         """Whether `start.scale` asks for the network's own metres. Raises ConfigError where it has none."""

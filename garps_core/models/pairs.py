@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from garps_core.config import TWO_VIEW, Config
-from garps_core.errors import ConfigError
+from garps_core.errors import ConfigError, GarpsError, ModelError
 from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
 from garps_core.models.manifest import of_file
 from garps_core.models.naver import NaverModel, digest
@@ -42,10 +42,18 @@ def pair_maps(source: Picture, target: Picture, config: Config) -> PairMaps:
 
     Raises:
         WeightsError: none installed, or not what they should be.
-        ModelError: too little memory, values that are not finite, or an adapter that fails.
+        ModelError: too little memory, values that are not finite, or whatever goes wrong in an adapter.
         ConfigError: no two-view network is chosen, or no adapter of that name is installed.
     """
-    return _ASKED(two_view_model(config), source, target)
+    model = two_view_model(config)
+    try:
+        return _ASKED(model, source, target)
+    except GarpsError:
+        raise
+    except Exception as error:
+        if config.start.method != "adapter":
+            raise
+        raise ModelError(f"the adapter {config.start.adapter!r} failed ({type(error).__name__}: {error})") from error
 
 
 def two_view_model(config: Config) -> TwoViewModel:
