@@ -13,7 +13,7 @@ import torch
 
 from garps_core import paper, solve
 from garps_core.config import Alignment, Config
-from garps_core.errors import InitialisationError, InputError, ModelError, WeightsError
+from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.initialise import identity, initialise
 from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
 from garps_core.photometric import sharpen
@@ -41,7 +41,7 @@ def estimate_relative_pose(
     Returns:
         PoseEstimate; when no pose could be had its status and reason say why and T_target_source is None.
     Raises:
-        ReconstructionError: a view holds too little depth.
+        ReconstructionError: a view holds too little depth, by itself; of a two-view network's depth the status says so.
         ConfigError: the device is not there, or settings do not go together.
         WeightsError: a network's weights are missing or not what they should be.
     """
@@ -75,9 +75,10 @@ def _estimated(
         if views != [source, target]:  # only a network takes time
             spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
         x, y = mixtures_of(views, config)
-    except ModelError as failure:
-        if isinstance(failure, WeightsError):  # a mistake of whoever set this up, not of these images
-            raise
+    except (ModelError, ReconstructionError) as failure:
+        of_pair = config.reconstruction.method == "two_view"
+        if isinstance(failure, WeightsError) or (isinstance(failure, ReconstructionError) and not of_pair):
+            raise  # a mistake of whoever set this up, not of these images
         return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
     spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
     try:

@@ -17,7 +17,7 @@ from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.config import METHODS, PRESETS, STARTS, TWO_VIEW, Config, Reconstruction
-from garps_core.errors import GarpsError, InputError
+from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.files import read_image, read_view
 from garps_core.focal import estimate_intrinsics
 from garps_core.initialise import identity
@@ -25,7 +25,7 @@ from garps_core.pairing import checked_device
 from garps_core.report import as_json, as_text
 from garps_core.settings import changed_config
 from garps_core.splat_reader import read_splats
-from garps_core.types import Mixture, PoseEstimate, Prior, View
+from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.weights_cli import app as weights_app
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
@@ -129,7 +129,7 @@ def align(
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
-        estimate, mixtures = estimate_with_mixtures(*_views(files, depths, Ks, depth_scale, config), config, given)
+        estimate, mixtures = _of_images(files, depths, Ks, depth_scale, config, given)
     print(json.dumps(as_json(estimate), indent=1, allow_nan=False) if json_ else as_text(estimate))
     _write_extras(estimate, mixtures, figure, ply)
     return 0 if estimate.ok else 1
@@ -174,6 +174,23 @@ def _of_splats(
     return align_mixtures(x, y, start or identity(config, "no --prior"), config), (x, y)
 
 
+def _of_images(
+    files: tuple[Path, Path],
+    depths: tuple[Path | None, Path | None],
+    Ks: tuple[Four | None, Four | None],
+    scale: Any,
+    config: Config,
+    given: Prior | None,
+) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
+    try:
+        views = _views(files, depths, Ks, scale, config)
+    except WeightsError:
+        raise
+    except (InitialisationError, ModelError) as failure:  # only a network that estimates intrinsics raises them
+        return PoseEstimate(Status.NO_INITIAL_POSE, f"no --K, and none by {config.start.method}: {failure}"), None
+    return estimate_with_mixtures(*views, config, given)
+
+
 def _views(
     files: tuple[Path, Path],
     depths: tuple[Path | None, Path | None],
@@ -181,6 +198,8 @@ def _views(
     scale: Any,
     config: Config,
 ) -> tuple[View, View]:
+    if Ks[0] is None and Ks[1] is not None:
+        raise InputError("--K-target is given without --K: expected both, --K alone if they are equal, or none")
     if Ks[0] is None:
         return _uncalibrated(files, depths, scale, config)
     of_source, of_target = _intrinsics("--K", Ks[0]), _intrinsics("--K-target", Ks[1] or Ks[0])

@@ -14,6 +14,8 @@ from garps_core.point_maps import Framing, PairMaps, Picture, PointMap
 STEPS = 10
 """Of the reweighted least squares; they converge in five or so."""
 MIN_PIXELS = 100
+SHORTEST, LONGEST = 0.2, 10.0
+"""Focal lengths that are believed, over the longer side of the image: 136 to 6 degrees wide."""
 
 
 def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tuple[Array, Array]:
@@ -25,7 +27,7 @@ def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tup
         source, target: HxWx3 uint8 RGB.
         config: `start.method` must be a two-view network.
     Raises:
-        InitialisationError: a map has hardly a point in front of its camera.
+        InitialisationError: a map has hardly a point in front of its camera, or tells of no focal length there is.
         ConfigError, WeightsError, ModelError: as `garps_core.models.pairs.pair_maps`.
     """
     from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
@@ -40,7 +42,7 @@ def intrinsics_of(maps: PairMaps, sizes: tuple[tuple[int, ...], tuple[int, ...]]
         maps: of the pair.
         sizes: (rows, columns) of both images.
     Raises:
-        InitialisationError: a map has hardly a point in front of its camera.
+        InitialisationError: a map has hardly a point in front of its camera, or tells of no focal length there is.
     """
     own = (maps.source_first[0], maps.target_first[0])
     return _intrinsics(own[0], maps.framings[0], sizes[0]), _intrinsics(own[1], maps.framings[1], sizes[1])
@@ -57,7 +59,13 @@ def _intrinsics(one: PointMap, framing: Framing, size: tuple[int, ...]) -> Float
         )
     px = framing.to_image(np.stack([columns, rows], axis=1).astype(np.float64)) - K[:2, 2]
     points = one.points[rows, columns].astype(np.float64)
-    K[0, 0] = K[1, 1] = focal_length(px, points[:, :2] / points[:, 2:])
+    f, side = focal_length(px, points[:, :2] / points[:, 2:]), max(size)
+    if not SHORTEST * side <= f <= LONGEST * side:
+        raise InitialisationError(
+            f"a focal length of {f:.3g} px would fit the points best, for an image of {width}x{height}: expected "
+            f"{SHORTEST * side:g} to {LONGEST * side:g}; give the intrinsics"
+        )
+    K[0, 0] = K[1, 1] = f
     return K
 
 

@@ -35,7 +35,7 @@ MIN_SHARE = 0.2
 """Of the trusted pixels that have to fit one pose; a network that fails gives points that fit none."""
 MIN_TRUSTED = 100
 BLOCKS = 6
-"""Blocks along the longer side whose residuals count as independent of each other's."""
+"""Blocks along the longer side of the trusted part whose residuals count as independent of each other's."""
 
 Bool = npt.NDArray[np.bool_]
 
@@ -136,7 +136,7 @@ def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
             f"{len(way.points)} of {total} pixels are surer than {config.start.min_confidence:g}: expected at least "
             f"{MIN_TRUSTED}; do the pictures share anything, are the weights trained?"
         )
-    unit = float(np.median(np.linalg.norm(way.points, axis=1)))  # a network without metres may have any unit
+    unit = float(np.median(np.linalg.norm(way.points, axis=1))) or 1.0  # a network without metres may have any unit
     T = ransac(replace(way, points=way.points / unit), THRESHOLD_PX, config, MIN_TRIALS)
     count = 0
     if T is not None:
@@ -223,6 +223,7 @@ def _spread(normal: Normal, px: Array) -> Array:
 
     The factor makes up for what a block takes part in the fit and so hides of its errors (Bell and McCaffrey 2002).
     """
+    px = px - px.min(0)
     side = (px.max() + 1) / BLOCKS  # a whole covariance from so few sums would be a wild one: its mean is all we take
     blocks = np.unique(np.floor(px / side).astype(int), axis=0, return_inverse=True)[1].ravel()
     count = int(blocks.max()) + 1

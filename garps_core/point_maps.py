@@ -29,7 +29,7 @@ class PointMap:
         confidence: hxw float32; the larger, the surer, on the network's own scale.
         descriptors: hxwxC float32 unit vectors that are alike where two pixels see the same, or None.
     Raises:
-        ModelError: other shapes, or a confidence that is not finite.
+        ModelError: other shapes or types, or a confidence that is not finite.
     """
 
     points: Float32Array
@@ -37,11 +37,15 @@ class PointMap:
     descriptors: Float32Array | None = None
 
     def __post_init__(self) -> None:
-        size = self.points.shape[:2]
+        size = tuple(self.points.shape[:2])
         parts = [self.points, self.confidence] + ([] if self.descriptors is None else [self.descriptors])
-        shapes = ", ".join("x".join(map(str, part.shape)) for part in parts)
-        if self.points.shape != (*size, 3) or any(part.shape[:2] != size or part.ndim > 3 for part in parts):
-            raise ModelError(f"a point map has arrays of {shapes}: expected points hxwx3, confidence hxw, of one size")
+        typed = all(isinstance(part, np.ndarray) and part.dtype == np.float32 for part in parts)
+        layers = [tuple(part.shape[2:]) for part in parts]
+        if not typed or layers[:2] != [(3,), ()] or any(tuple(part.shape[:2]) != size for part in parts):
+            told = ", ".join(f"{'x'.join(map(str, part.shape))} {part.dtype}" for part in parts)
+            raise ModelError(
+                f"a point map has arrays of {told}: expected points hxwx3, confidence hxw, of one size, numpy float32"
+            )
         if not np.isfinite(self.confidence).all():
             raise ModelError("the confidence of a point map is not finite: expected a number for every pixel")
 

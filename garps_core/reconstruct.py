@@ -14,10 +14,12 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numpy as np
+
 from garps_core.checks import Float32Array
 from garps_core.config import TWO_VIEW, Config
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
-from garps_core.lift import lift
+from garps_core.lift import MIN_COMPONENTS, lift
 from garps_core.map_pose import own_depth
 from garps_core.types import Mixture, View
 
@@ -77,12 +79,19 @@ def _of_pair(views: Sequence[View], config: Config) -> list[View]:
         raise ConfigError(
             f"reconstruction.method is two_view, whose network looks at pairs: expected 2 views, not {len(views)}"
         )
-    maps = pair_maps(views[0].rgb, views[1].rgb, config)
+    maps, least = pair_maps(views[0].rgb, views[1].rgb, config), config.start.min_confidence
     if not maps.metric:
         raise ConfigError(
             f"reconstruction.method is two_view and the points of {maps.origin} have no metres: expected mast3r"
         )
-    depths = own_depth(maps, views[0], views[1], config.start.min_confidence)
+    depths = own_depth(maps, views[0], views[1], least)
+    for name, depth in zip(("source", "target"), depths, strict=True):
+        if (count := int(np.isfinite(depth).sum())) < MIN_COMPONENTS:
+            raise ReconstructionError(
+                f"{maps.origin} gives {count} of {depth.size} pixels of the {name} depth of which it is surer than "
+                f"{least:g}: expected at least {MIN_COMPONENTS}; do the pictures share anything, are the weights "
+                "trained, is start.min_confidence on the network's scale?"
+            )
     return [_given(view, depth) for view, depth in zip(views, depths, strict=True)]
 
 
@@ -128,6 +137,8 @@ def check_settings(config: Config) -> None:
             f"reconstruction.method is two_view and start.method is {config.start.method}: expected a two-view network "
             f"to start with, one of {', '.join(TWO_VIEW)}"
         )
+    if config.reconstruction.method == "two_view" and config.start.method == "dust3r":
+        raise ConfigError("reconstruction.method is two_view and the points of dust3r have no metres: expected mast3r")
     if config.alignment.depth_errors or config.alignment.solver == "adam":
         return
     if config.reconstruction.method == "auto":

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights files in the published layout, filled by `golden_rule`, in a folder of weights; and small views."""
 
+import re
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import golden_rule
 import numpy as np
 import torch
+from safetensors.torch import save_file
 from test_cli import TRUTH, K, room
 from torch import nn
 
 from garps_core import View
 from garps_core.models.manifest import BY_NAME
-from garps_core.models.two_view import Architecture, Stack
+from garps_core.models.two_view import Architecture, Stack, TwoView
 
 DEPTH, FLASH3D, BACKBONE = "depth-anything-v2-indoor-small", "flash3d", "dinov2-small"
 GOLDEN = {
@@ -86,3 +90,48 @@ def two_view_tensors(name: str) -> dict[str, torch.Tensor]:
 def with_aliases(name: str, held: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """As a torch file holds them, some under two names."""
     return held | {alias: held[own] for alias, own in golden_rule.keys(name)["aliases"].items()}
+
+
+def _two_view(width: int, decoder: int, **told: Any) -> Architecture:
+    return Architecture(Stack(width, 2, width // 64), Stack(decoder, 4, decoder // 64), **told)
+
+
+REDUCED = {
+    "mast3r": _two_view(128, 64, descriptors=24),
+    "dust3r-dpt": _two_view(128, 64),
+    "dust3r-linear": _two_view(128, 64, linear=True),
+    "dust3r-linear-224": _two_view(64, 64, linear=True),
+}
+"""Published two-view files -> networks with attention heads as wide, so that a file tells their sizes."""
+AHEAD, SURE = 1.0, 3.0
+"""Added to z and to the confidence, before their activations: 1.7 m, and all pixels are trusted."""
+
+
+def reduced_tensors(name: str, sureness: float = SURE) -> dict[str, torch.Tensor]:
+    """Of a reduced network with random parameters, as its safetensors file holds them; its points lie ahead."""
+    torch.manual_seed(len(name))
+    state = TwoView(REDUCED[name]).state_dict()
+    for head in ("downstream_head1", "downstream_head2"):
+        if REDUCED[name].linear:
+            state[f"{head}.proj.bias"].view(4, -1)[2:] += torch.tensor([[AHEAD], [sureness]])
+        else:
+            state[f"{head}.dpt.head.4.bias"][2:] += torch.tensor([AHEAD, sureness])
+    return state
+
+
+def install_reduced(folder: Path, *names: str, **changed: float) -> Path:
+    """Write reduced two-view files under the published names; those that end in -pth as the authors wrote them."""
+    for name in names:
+        held, path = reduced_tensors(name.removesuffix("-pth"), **changed), folder / BY_NAME[name].local
+        if path.suffix == ".safetensors":
+            save_file(held, path)
+        else:
+            torch.save({"args": Namespace(model="AsymmetricMASt3R"), "model": held | second_names(held)}, path)
+    return folder
+
+
+def second_names(held: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The parts of a dense head that torch files hold twice, under their other names."""
+    found = re.compile(r"(.*\.scratch\.)layer([1-4])_rn\.(.*)")
+    told = {key: found.fullmatch(key) for key in held}
+    return {f"{m[1]}layer_rn.{int(m[2]) - 1}.{m[3]}": held[key] for key, m in told.items() if m}

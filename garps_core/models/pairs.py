@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from garps_core.config import TWO_VIEW, Config
-from garps_core.errors import ConfigError, GarpsError, ModelError
+from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, WeightsError
 from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
 from garps_core.models.manifest import of_file
 from garps_core.models.naver import NaverModel, digest
@@ -46,14 +46,18 @@ def pair_maps(source: Picture, target: Picture, config: Config) -> PairMaps:
         ConfigError: no two-view network is chosen, or no adapter of that name is installed.
     """
     model = two_view_model(config)
-    try:
+    if config.start.method != "adapter":
         return _ASKED(model, source, target)
-    except GarpsError:
+    name = config.start.adapter
+    try:
+        found = _ASKED(model, source, target)
+    except (ConfigError, InputError, WeightsError):
         raise
     except Exception as error:
-        if config.start.method != "adapter":
-            raise
-        raise ModelError(f"the adapter {config.start.adapter!r} failed ({type(error).__name__}: {error})") from error
+        raise ModelError(f"the adapter {name!r} failed ({_told(error)})") from error
+    if not isinstance(found, PairMaps):
+        raise ModelError(f"the adapter {name!r} returned an object of class {type(found).__name__}: expected PairMaps")
+    return found
 
 
 def two_view_model(config: Config) -> TwoViewModel:
@@ -73,7 +77,10 @@ def _model(kind: str, weights: str, dtype: str) -> NaverModel:
     path, read = tensors_of(weights, kind)
     known = of_file(path.name)
     variant = known.variant if known is not None else read.metadata.get("variant", "")
-    return NaverModel(built_from(read.tensors), variant, DTYPE[dtype])
+    model = NaverModel(built_from(read.tensors), variant, DTYPE[dtype])
+    if model.origin != kind:
+        raise WeightsError(f"{path} holds {model.network.architecture.name}: expected weights of {kind}, start.method")
+    return model
 
 
 @once
@@ -86,6 +93,12 @@ def _adapter(name: str, weights: str, device: str) -> TwoViewModel:
         )
     try:
         load: Callable[[str, str], TwoViewModel] = there[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"the adapter {name!r} ({there[name].value}) cannot be loaded: {error}") from None
-    return load(weights, device)
+        return load(weights, device)
+    except GarpsError:
+        raise
+    except Exception as error:  # whatever is wrong with a package of somebody else's, or with its weights
+        raise ConfigError(f"the adapter {name!r} ({there[name].value}) cannot be loaded: {_told(error)}") from error
+
+
+def _told(error: Exception) -> str:
+    return str(error) if isinstance(error, GarpsError) else f"{type(error).__name__}: {error}"
