@@ -28,6 +28,9 @@ from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 SEARCHED_SIGMAS = 3.0
 """What a search found may be a neighbour of the right optimum: its sigmas count so many times as much."""
 
+CENTRING = 0.01
+"""Sigma of a principal point that is taken to lie in the image's middle, over the image's longer side."""
+
 
 def estimate_relative_pose(
     source: View, target: View, config: Config | None = None, prior: Prior | None = None
@@ -52,17 +55,20 @@ def estimate_with_mixtures(
     source: View, target: View, config: Config | None = None, prior: Prior | None = None
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
-    config = _doubting(config or Config(), source.K_estimated or target.K_estimated)
-    estimate, mixtures = _estimated(source, target, config, prior)
+    estimate, mixtures = _estimated(source, target, config or Config(), prior)
     focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
     return replace(estimate, estimated_fx_px=(focal[0], focal[1])), mixtures
 
 
-def _doubting(config: Config, intrinsics: bool) -> Config:
-    """With more doubt about the shape of both depth maps where intrinsics are estimates: that is what they warp."""
-    sigmas = {"lifting.scale_sigma": config.lifting.scale_sigma, "lifting.warp_sigma": config.lifting.warp_sigma}
-    wider = {name: float(np.hypot(sigma, config.start.focal_sigma)) for name, sigma in sigmas.items()}
-    return config.replace(wider) if intrinsics else config
+def _doubting(config: Config, *views: View) -> Config:
+    """With more doubt about both views' shape and direction where intrinsics are estimates; the shape is solved for."""
+    middles = [CENTRING * max(view.rgb.shape[:2]) / view.K[0, 0] for view in views if view.K_estimated]
+    if not middles:
+        return config
+    focal = config.start.focal_sigma
+    more = {"scale_sigma": focal, "warp_sigma": focal, "pointing_sigma_rad": max(middles)}
+    wider = {f"lifting.{name}": float(np.hypot(getattr(config.lifting, name), sigma)) for name, sigma in more.items()}
+    return config.replace(wider | {"alignment.depth_errors": True})
 
 
 def _estimated(
@@ -74,6 +80,7 @@ def _estimated(
         views = with_depth((source, target), config)
         if views != [source, target]:  # only a network takes time
             spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
+        config = _doubting(config, *views)
         x, y = mixtures_of(views, config)
     except (ModelError, ReconstructionError) as failure:
         of_pair = config.reconstruction.method == "two_view"
