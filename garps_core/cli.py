@@ -22,6 +22,7 @@ from garps_core.files import read_image, read_view
 from garps_core.focal import estimate_intrinsics
 from garps_core.initialise import identity
 from garps_core.pairing import checked_device
+from garps_core.reconstruct import check_settings
 from garps_core.report import as_json, as_text
 from garps_core.settings import changed_config
 from garps_core.splat_reader import read_splats
@@ -214,6 +215,8 @@ def _uncalibrated(
             "--K is missing: expected FX FY CX CY in pixels, from the camera's calibration; or a two-view network that "
             f"can estimate it, --start {' or '.join(TWO_VIEW)}"
         )
+    if config.reconstruction.method == "two_view":
+        check_settings(config)
     K_source, K_target = estimate_intrinsics(read_image(files[0]), read_image(files[1]), config)
     source, target = (
         read_view(*given, scale, K_estimated=True) for given in zip(files, (K_source, K_target), depths, strict=True)
