@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from garps_core.checks import Float32Array
 from garps_core.config import Config
-from garps_core.errors import InitialisationError
+from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, transform
 from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, OneWay, inliers_of, keep, normal_equations, ransac
 from garps_core.point_maps import Framing, PairMaps, PointMap
@@ -103,7 +103,10 @@ def pose_from_maps(maps: PairMaps, source: View, target: View, config: Config) -
     reason = "; ".join([f"{best} first: {pose.reason}", *failures])
     if contradiction > 1:
         reason += f"; the other order contradicts it, sigmas times {np.sqrt(contradiction):.1f}"
-    return Prior(pose.T, covariance, maps.origin, reason)
+    try:
+        return Prior(pose.T, covariance, maps.origin, reason)
+    except InputError as error:  # of points beyond all measure
+        raise InitialisationError(f"{maps.origin}: {reason}; {error}") from None
 
 
 def _orders(maps: PairMaps, source: View, target: View, min_confidence: float) -> dict[str, _Order]:

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import two_view_fixtures
 from network_weights import write_pair
 from point_map_cases import Errors, point_maps, true_views
 from test_cli import K_WORDS
@@ -22,7 +21,7 @@ from garps_core.errors import WeightsError
 from garps_core.focal import estimate_intrinsics
 from garps_core.geometry import se3_exp, se3_inverse, se3_log
 from garps_core.initialise import initialise
-from garps_core.point_maps import PairMaps
+from garps_core.point_maps import PairMaps, PointMap
 from garps_core.types import Mixture
 from garps_core.uncertainty import twist_from_ros
 
@@ -30,6 +29,7 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "two_view_models.md"
 ERRORS = Errors(noise=0.005, patches=0.005, scale=0.03)
 LARGEST_NEES = 22.46
 """Of six numbers, with 99.9 %."""
+BY_PAIR = {"reconstruction.method": "two_view", "alignment.depth_errors": True}
 Captured = pytest.CaptureFixture[str]
 
 
@@ -174,6 +174,20 @@ def test_what_is_unknown_or_unsure_is_left_out(room: RoomPair, tmp_path: Path) -
     blind = estimate_relative_pose(*sensed(room), settings.replace({"start.min_confidence": 20.0}))
     assert blind.status is Status.NO_INITIAL_POSE
     assert "0 of 3072 pixels are surer than 20" in blind.reason
+
+
+@pytest.mark.parametrize("factor", [1e30, 1e-30, 0.0, -1.0])
+def test_points_that_cannot_be_are_no_pose(room: RoomPair, said: PairMaps, tmp_path: Path, factor: float) -> None:
+    orders = [
+        tuple(PointMap(one.points * np.float32(factor), one.confidence) for one in order)
+        for order in (said.source_first, said.target_first)
+    ]
+    wild = PairMaps(orders[0], orders[1], said.framings, True, "wild")
+    settings = recorded(write_maps(tmp_path / "wild.npz", (room.rgb0, room.rgb1, wild)), "default")
+    found = estimate_relative_pose(*sensed(room), settings)
+    assert not found.ok and found.quality < 0.1, found
+    found = estimate_relative_pose(*bare(room), settings.replace(BY_PAIR))
+    assert found.status is Status.NO_MIXTURE, found.reason
 
 
 def mixtures_in(room: RoomPair, settings: Config) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
@@ -340,7 +354,3 @@ def test_the_documented_adapter_says_what_its_network_sees(robot: Path) -> None:
     )
     np.testing.assert_array_equal(said.source_first[1].points, said.target_first[0].points)
     assert np.abs(said.source_first[0].points - said.target_first[0].points).max() > 0.1
-
-
-def test_the_names_of_the_faults_are_those_of_adapters() -> None:
-    assert all(callable(getattr(two_view_fixtures, name)) for name in FAULTS)
