@@ -14,6 +14,7 @@ import torch
 from garps_core import paper, solve
 from garps_core.config import Alignment, Config
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
+from garps_core.geometry import Array
 from garps_core.initialise import identity, initialise
 from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
 from garps_core.photometric import sharpen
@@ -91,6 +92,7 @@ def _estimated(
     try:
         starts = initialise(views[0], views[1], config, prior)
     except InitialisationError as failure:
+        spent["initialise"] = time.perf_counter() - begin
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)
     spent["initialise"], begin = time.perf_counter() - begin, time.perf_counter()
     estimate = _best_of(x, y, starts, config)
@@ -216,6 +218,12 @@ def _known(initial: Prior, config: Config) -> Belief:
     return Belief(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
 
 
+def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
+    """With an error of scale that both depth maps and the start share, so that nothing in the pair can show it."""
+    along = np.concatenate([T[:3, 3], np.zeros(3)])
+    return np.asarray(covariance + sigma**2 * np.outer(along, along))
+
+
 def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool, config: Config) -> Finding:
     """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
@@ -226,4 +234,6 @@ def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool,
         seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
     if seen is not None and settings.brightness > 0:
         T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)
+    if config.reconstruction.method == "two_view":
+        covariance = _of_one_scale(covariance, T, config.start.network_scale_sigma)
     return Finding(solution, T, covariance, overlap(x, y, T, settings), seen)

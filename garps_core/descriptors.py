@@ -21,7 +21,7 @@ ROUNDS = 10
 BORDER_PX = 3
 """The descriptors of pixels so near to the border are not used."""
 CHUNK = 256
-"""Pixels that look for their neighbour at once: 150 MB of similarities at 512x384."""
+"""Pixels that look for their neighbour at once: 200 MB of similarities at 512x384."""
 
 Index = npt.NDArray[np.intp]
 
@@ -34,18 +34,31 @@ def match_descriptors(maps: PairMaps, source: View, target: View, config: Config
         source, target: their depth is used where `start.scale` asks for it, or where the network has no metres.
         config: `start` is used.
     Raises:
-        InitialisationError: the network has no descriptors.
+        InitialisationError: the network has no descriptors, or is sure of no match.
     """
     of_source, of_target = maps.source_first
     if of_source.descriptors is None or of_target.descriptors is None:
         raise InitialisationError(f"{maps.origin} has no descriptors to match: set start.pose_from to maps")
-    seen_s, seen_t = reciprocal(of_source.descriptors, of_target.descriptors)
+    seen_s, seen_t = _sure(*reciprocal(of_source.descriptors, of_target.descriptors), maps, config)
     px_s, px_t = (framing.to_image(px) for framing, px in zip(maps.framings, (seen_s, seen_t), strict=True))
     if maps.gives_metres(config.start.scale):
         points = _points(maps.source_first[0], seen_s), _points(maps.target_first[0], seen_t)
     else:
         points = points_at(source, px_s), points_at(target, px_t)
     return Matches(px_s, px_t, *points)
+
+
+def _sure(px_s: Array, px_t: Array, maps: PairMaps, config: Config) -> tuple[Array, Array]:
+    """The matches of pixels that the network is sure of on both sides."""
+    sides = zip(maps.trusted(config.start.min_confidence), (px_s, px_t), strict=True)
+    on_source, on_target = (trusted[tuple(px.astype(int).T[::-1])] for trusted, px in sides)
+    sure = on_source & on_target
+    if not sure.any():
+        raise InitialisationError(
+            f"{maps.origin}: of {len(sure)} matches none is surer than {config.start.min_confidence:g} on both sides; "
+            "do the pictures share anything, are the weights trained?"
+        )
+    return px_s[sure], px_t[sure]
 
 
 def reciprocal(a: Float32Array, b: Float32Array) -> tuple[Array, Array]:

@@ -9,13 +9,15 @@ from garps_core.checks import Float64Array
 from garps_core.config import Config
 from garps_core.errors import InitialisationError
 from garps_core.geometry import Array
-from garps_core.point_maps import Framing, PairMaps, Picture, PointMap
+from garps_core.point_maps import Bool, Framing, PairMaps, Picture, PointMap
 
 STEPS = 10
 """Of the reweighted least squares; they converge in five or so."""
 MIN_PIXELS = 100
 SHORTEST, LONGEST = 0.2, 10.0
 """Focal lengths that are believed, over the longer side of the image: 136 to 6 degrees wide."""
+STEEPEST = 0.5 / SHORTEST
+"""Slope of a ray that such a camera can see."""
 
 
 def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tuple[Array, Array]:
@@ -32,30 +34,37 @@ def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tup
     """
     from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
 
-    return intrinsics_of(pair_maps(source, target, config), (source.shape[:2], target.shape[:2]))
+    maps = pair_maps(source, target, config)
+    return intrinsics_of(maps, (source.shape[:2], target.shape[:2]), config.start.min_confidence)
 
 
-def intrinsics_of(maps: PairMaps, sizes: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[Array, Array]:
+def intrinsics_of(
+    maps: PairMaps, sizes: tuple[tuple[int, ...], tuple[int, ...]], least: float = 0.0
+) -> tuple[Array, Array]:
     """3x3 K of source and target, pixel centres at integers: square pixels, principal point in the image's middle.
 
     Args:
         maps: of the pair.
         sizes: (rows, columns) of both images.
+        least: pixels that are less sure than this are left out.
     Raises:
         InitialisationError: a map has hardly a point in front of its camera, or tells of no focal length there is.
     """
-    own = (maps.source_first[0], maps.target_first[0])
-    return _intrinsics(own[0], maps.framings[0], sizes[0]), _intrinsics(own[1], maps.framings[1], sizes[1])
+    own, trusted = (maps.source_first[0], maps.target_first[0]), maps.trusted(least)
+    of_source, of_target = map(_intrinsics, own, trusted, maps.framings, sizes)
+    return of_source, of_target
 
 
-def _intrinsics(one: PointMap, framing: Framing, size: tuple[int, ...]) -> Float64Array:
+def _intrinsics(one: PointMap, trusted: Bool, framing: Framing, size: tuple[int, ...]) -> Float64Array:
     height, width = size
     K = np.array([[1.0, 0.0, (width - 1) / 2], [0.0, 1.0, (height - 1) / 2], [0.0, 0.0, 1.0]])
-    rows, columns = np.nonzero(np.isfinite(one.points).all(-1) & (one.points[..., 2] > 0))
+    x, y, z = np.moveaxis(one.points, -1, 0)
+    ahead = z * STEEPEST > np.maximum(abs(x), abs(y))  # false for NaN; beyond, no camera that is believed sees anything
+    rows, columns = np.nonzero(trusted & ahead)
     if len(rows) < MIN_PIXELS:
         raise InitialisationError(
-            f"{len(rows)} points lie in front of their camera: expected at least {MIN_PIXELS} to tell its focal "
-            "length from; give the intrinsics"
+            f"{len(rows)} trusted points lie in front of their camera: expected at least {MIN_PIXELS} to tell its "
+            "focal length from; give the intrinsics"
         )
     px = framing.to_image(np.stack([columns, rows], axis=1).astype(np.float64)) - K[:2, 2]
     points = one.points[rows, columns].astype(np.float64)

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from garps_core.config import TWO_VIEW, Config
+from garps_core.config import TWO_VIEW, Config, Start
 from garps_core.descriptors import match_descriptors
-from garps_core.errors import InitialisationError, ModelError, WeightsError
+from garps_core.errors import ConfigError, InitialisationError, ModelError, WeightsError
 from garps_core.features import match_features
 from garps_core.geometry import se3_exp, se3_inverse, se3_log
 from garps_core.map_pose import pose_from_maps
@@ -36,6 +36,7 @@ def initialise(
     config = config or Config()
     method = config.start.method
     if method in TWO_VIEW:
+        check_start(config.start)
         found = _by_network(source, target, config)
         return (found,) if prior is None else combined(prior, found, config.start.max_contradiction)
     if method == "identity":
@@ -53,6 +54,18 @@ def initialise(
     return (found,) if prior is None or method == "features" else combined(prior, found, config.start.max_contradiction)
 
 
+def check_start(start: Start) -> None:
+    """Raises ConfigError for a two-view network that cannot do what the other settings of the start ask for."""
+    if start.method == "dust3r" and start.scale == "network":
+        raise ConfigError("start.scale is network, and dust3r has no metres: expected auto or depth")
+    if start.method == "dust3r" and start.pose_from == "matches":
+        raise ConfigError("start.pose_from is matches, and dust3r has no descriptors: expected maps")
+    if start.method == "adapter" and not start.adapter:
+        raise ConfigError(
+            "start.method is adapter and start.adapter is empty: expected the name of an installed adapter"
+        )
+
+
 def _by_network(source: View, target: View, config: Config) -> Prior:
     from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
 
@@ -65,9 +78,14 @@ def _by_network(source: View, target: View, config: Config) -> Prior:
     if config.start.pose_from == "maps":
         return pose_from_maps(maps, source, target, config)
     matches = match_descriptors(maps, source, target, config)
+    coarsest = max(1.0, *(1 / side for framing in maps.framings for side in framing.scale))  # its pixel, in the image's
+    config = config.replace({"start.ransac_px": min(config.start.ransac_px * coarsest, 50.0)})
     if maps.gives_metres(config.start.scale):
-        errors = {"scale": config.start.network_scale_sigma, "warp": config.start.network_warp_sigma}
-        config = config.replace({f"lifting.{name}_sigma": sigma for name, sigma in errors.items()})
+        # PnP takes both views' scales for independent of each other: of one error it sees half the variance.
+        errors = {"scale_sigma": np.sqrt(2) * config.start.network_scale_sigma}
+        errors["warp_sigma"] = config.start.network_warp_sigma
+        wider = {f"lifting.{name}": max(float(e), getattr(config.lifting, name)) for name, e in errors.items()}
+        config = config.replace(wider)
     return pose_from_matches(matches, source, target, config, maps.origin)
 
 

@@ -20,7 +20,7 @@ from garps_core.config import Config
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, transform
 from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, OneWay, inliers_of, keep, normal_equations, ransac
-from garps_core.point_maps import Framing, PairMaps, PointMap
+from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
 from garps_core.systematic import shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
@@ -36,8 +36,6 @@ MIN_SHARE = 0.2
 MIN_TRUSTED = 100
 BLOCKS = 6
 """Blocks along the longer side of the trusted part whose residuals count as independent of each other's."""
-
-Bool = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,11 +108,7 @@ def pose_from_maps(maps: PairMaps, source: View, target: View, config: Config) -
 
 
 def _orders(maps: PairMaps, source: View, target: View, min_confidence: float) -> dict[str, _Order]:
-    """Both orders; a pixel is trusted where either of its picture's two maps is sure of it."""
-    of_source, of_target = (
-        np.maximum(one.confidence, other.confidence) > min_confidence
-        for one, other in ((maps.source_first[0], maps.target_first[1]), (maps.target_first[0], maps.source_first[1]))
-    )
+    of_source, of_target = maps.trusted(min_confidence)
     return {
         "source": _order((source, target), maps.framings, maps.source_first, (of_source, of_target)),
         "target": _order((target, source), maps.framings[::-1], maps.target_first, (of_target, of_source)),
@@ -140,12 +134,13 @@ def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
             f"{MIN_TRUSTED}; do the pictures share anything, are the weights trained?"
         )
     unit = float(np.median(np.linalg.norm(way.points, axis=1))) or 1.0  # a network without metres may have any unit
-    T = ransac(replace(way, points=way.points / unit), THRESHOLD_PX, config, MIN_TRIALS)
+    of_one = replace(way, points=way.points / unit)
+    T = ransac(of_one, THRESHOLD_PX, config, MIN_TRIALS)
     count = 0
     if T is not None:
-        T[:3, 3] *= unit
-        fitting = inliers_of(way, T, THRESHOLD_PX)
+        fitting = inliers_of(of_one, T, THRESHOLD_PX)
         count = int(fitting.sum())
+        T[:3, 3] *= unit
     if T is None or count < MIN_SHARE * len(way.points):
         raise InitialisationError(
             f"{count} of {len(way.points)} trusted pixels fit one pose: expected at least {MIN_SHARE:.0%}"

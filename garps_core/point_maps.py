@@ -17,6 +17,7 @@ from garps_core.errors import ConfigError, ModelError
 from garps_core.geometry import Array
 
 Picture = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +106,12 @@ class PairMaps:
             found = [one.confidence.shape for one in order]
             if found != [tuple(size) for size in sizes]:
                 raise ModelError(f"{self.origin} gives point maps of {found} pixels: expected {sizes}, its framings'")
+
+    def trusted(self, least: float) -> tuple[Bool, Bool]:
+        """Pixels of source and target of which either of the picture's two maps is surer than `least`."""
+        of_source = np.maximum(self.source_first[0].confidence, self.target_first[1].confidence) > least
+        of_target = np.maximum(self.target_first[0].confidence, self.source_first[1].confidence) > least
+        return of_source, of_target
 
     def gives_metres(self, scale: str) -> bool:
         """Whether `start.scale` asks for the network's own metres. Raises ConfigError where it has none."""

@@ -19,6 +19,7 @@ import numpy as np
 from garps_core.checks import Float32Array
 from garps_core.config import TWO_VIEW, Config
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
+from garps_core.initialise import check_start
 from garps_core.lift import MIN_COMPONENTS, lift
 from garps_core.map_pose import own_depth
 from garps_core.types import Mixture, View
@@ -132,6 +133,7 @@ def mixtures_of(views: Sequence[View], config: Config) -> list[Mixture]:
 
 def check_settings(config: Config) -> None:
     """Raises ConfigError where depth from a network meets settings for a sensor's; for auto it is a view's fault."""
+    check_start(config.start)
     if config.reconstruction.method == "two_view" and config.start.method not in TWO_VIEW:
         raise ConfigError(
             f"reconstruction.method is two_view and start.method is {config.start.method}: expected a two-view network "

@@ -14,6 +14,7 @@ from garps_core import compiled
 from garps_core.align import estimate_relative_pose
 from garps_core.config import TWO_VIEW, Config, Lifting, Reconstruction, Start
 from garps_core.errors import ConfigError
+from garps_core.initialise import check_start
 from garps_core.reconstruct import check_settings, with_depth
 from garps_core.types import Prior, View
 from garps_ros.tracking import MIN_DEPTH_SHARE
@@ -30,12 +31,13 @@ def needs_depth(config: Config) -> bool:
 
 
 def check_method(config: Config) -> None:
-    """Raises ConfigError where `reconstruction.method` wants no images, or other settings than these."""
+    """Raises ConfigError where `reconstruction.method` wants no images, or settings do not go together."""
     if config.reconstruction.method == "ply":
         raise ConfigError(
             "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network "
             f"({', '.join(NETWORKS)}) for images on topics; `garps align a.ply b.ply` takes files"
         )
+    check_start(config.start)
     if not needs_depth(config):
         check_settings(config)
 

@@ -198,11 +198,16 @@ class Solver:
         return found
 
     def _use_of_prior(self, found: PoseEstimate) -> str:
-        """What became of the given prior: used, alone or with features, or why not."""
+        """What became of the given prior: used, alone or with what was measured, or why not."""
         method = self._job.config.start.method
-        if found.initial is not None and found.initial.origin.startswith("given"):
+        if found.initial is None:
+            return f"not used: {found.status.value}"
+        if found.initial.origin.startswith("given"):
             return "used"
-        return f"not used: start.method is {method}" if method != "auto" else "not used: features contradict it"
+        if method in ("features", "identity"):
+            return f"not used: start.method is {method}"
+        verb = "contradict" if found.initial.origin == "features" else "contradicts"
+        return f"not used: {found.initial.origin} {verb} it"
 
     def _renamed(self, outcome: Origin | Outcome) -> Origin | Outcome:
         """With the frame names that the settings ask for."""

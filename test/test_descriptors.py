@@ -88,3 +88,17 @@ def test_a_network_without_descriptors_is_named(pair):
     source, target, T, _ = pair
     with pytest.raises(InitialisationError, match=r"made has no descriptors .* set start\.pose_from to maps"):
         match_descriptors(point_maps((source, target), T), source, target, CONFIG)
+
+
+def test_matches_the_network_is_not_sure_of_are_left_out(pair):
+    source, target, _, maps = pair
+    left = maps.source_first[0].confidence.copy()
+    left[:, :128] = 1.0
+    doubtful = [replace(maps.source_first[0], confidence=left), maps.source_first[1]]
+    same = [maps.target_first[0], replace(maps.target_first[1], confidence=left)]
+    found = match_descriptors(
+        replace(maps, source_first=tuple(doubtful), target_first=tuple(same)), source, target, CONFIG
+    )
+    assert len(found) > 50 and found.source_px[:, 0].min() > 128 / maps.framings[0].scale[0] - 1
+    with pytest.raises(InitialisationError, match="none is surer than 50 on both sides"):
+        match_descriptors(maps, source, target, CONFIG.replace({"start.min_confidence": 50.0}))

@@ -44,5 +44,17 @@ def test_points_behind_the_camera_tell_nothing():
     views = true_views(pair)
     maps = point_maps(views, pair.T_1_0)
     maps.source_first[0].points[..., 2] *= -1
-    with pytest.raises(InitialisationError, match="0 points lie in front of their camera"):
+    with pytest.raises(InitialisationError, match="0 trusted points lie in front of their camera"):
         intrinsics_of(maps, ((240, 320), (240, 320)))
+
+
+def test_pixels_the_network_does_not_trust_are_left_out():
+    pair = make_pair(3, 2, 1.0, 320, 240)
+    views = tuple(centred(view) for view in true_views(pair))
+    maps = point_maps(views, pair.T_1_0)
+    rng, own = np.random.default_rng(0), maps.source_first[0]
+    wild = rng.random(own.confidence.shape) < 0.1
+    own.points[wild] = rng.uniform(-3, 3, (int(wild.sum()), 3))
+    own.confidence[wild] = maps.target_first[1].confidence[wild] = 1.0
+    K, _ = intrinsics_of(maps, ((240, 320), (240, 320)), 3.0)
+    assert K[0, 0] == pytest.approx(views[0].K[0, 0], rel=1e-5)

@@ -165,7 +165,7 @@ def test_blank_images_without_a_fallback_have_no_initial_pose(config):
     estimate = estimate_relative_pose(BLANK, BLANK, config)
     assert estimate.status is Status.NO_INITIAL_POSE and not estimate.ok
     assert estimate.T_target_source is None and estimate.covariance is None and estimate.initial is None
-    assert estimate.reason.startswith("0 feature matches") and set(estimate.seconds) == {"reconstruct"}
+    assert estimate.reason.startswith("0 feature matches") and set(estimate.seconds) == {"reconstruct", "initialise"}
 
 
 def test_one_blank_view_is_no_match():

@@ -241,3 +241,14 @@ def test_the_made_maps_are_what_they_claim(landscape):
     points = exact_points(source.depth, source.K, framing)
     second = point_maps((source, target), T).target_first[1].points
     assert second == pytest.approx(transform(T, points), abs=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1e3])
+def test_any_unit_will_do(landscape, factor):
+    views, T = landscape
+    noisy = point_maps(views, T, Errors(noise=0.01))
+    counts = [
+        pose_from_maps(maps, *views, CONFIG.replace({"start.scale": "depth"})).reason.split()[2]
+        for maps in (noisy, scaled(noisy, factor))
+    ]
+    assert abs(int(counts[0]) - int(counts[1])) < 20

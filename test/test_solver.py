@@ -18,7 +18,7 @@ from garps_core.align import estimate_relative_pose
 from garps_core.errors import InputError
 from garps_core.geometry import se3_inverse
 from garps_core.reconstruct import reconstruct
-from garps_core.types import PoseEstimate, Status
+from garps_core.types import PoseEstimate, Prior, Status
 from garps_ros import solver
 from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.estimates import Origin, ViewReader, estimate_keyframes, estimate_pair
@@ -382,9 +382,14 @@ def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
 
 
-def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch):
-    answering(monkeypatch, recordings.estimate)
-    assert solve(*pair(), prior=given("target_optical")).prior == "not used: features contradict it"
+@pytest.mark.parametrize(
+    ("origin", "told"),
+    [("features", "features contradict it"), ("mast3r", "mast3r contradicts it"), (None, "converged")],
+)
+def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch, origin, told):
+    start = origin and Prior(np.eye(4), np.eye(6), origin)
+    answering(monkeypatch, lambda source, target: replace(recordings.estimate(source, target), initial=start))
+    assert solve(*pair(), prior=given("target_optical")).prior == f"not used: {told}"
 
 
 def test_frame_names_that_cannot_be_right_are_doubted(calls):

@@ -12,7 +12,7 @@ from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, W
 from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
 from garps_core.models.manifest import of_file
 from garps_core.models.naver import NaverModel, digest
-from garps_core.models.two_view import built_from
+from garps_core.models.two_view import TwoView, built_from
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
 
 ADAPTERS = "garps_core.two_view"
@@ -30,6 +30,7 @@ class _Asked:
         key = digest(source) + digest(target)
         with self._lock:
             if self._answer is None or self._answer[0] is not model or self._answer[1] != key:
+                self._answer = None  # it would keep a network alive that is no longer asked
                 self._answer = model, key, model(source, target)
             return self._answer[2]
 
@@ -74,13 +75,18 @@ def two_view_model(config: Config) -> TwoViewModel:
 
 @once
 def _model(kind: str, weights: str, dtype: str) -> NaverModel:
+    network, variant = _network(kind, weights)
+    return NaverModel(network, variant, DTYPE[dtype])
+
+
+@once
+def _network(kind: str, weights: str) -> tuple[TwoView, str]:
     path, read = tensors_of(weights, kind)
     known = of_file(path.name)
-    variant = known.variant if known is not None else read.metadata.get("variant", "")
-    model = NaverModel(built_from(read.tensors), variant, DTYPE[dtype])
-    if model.origin != kind:
-        raise WeightsError(f"{path} holds {model.network.architecture.name}: expected weights of {kind}, start.method")
-    return model
+    network = built_from(read.tensors)
+    if (network.architecture.descriptors > 0) != (kind == "mast3r"):
+        raise WeightsError(f"{path} holds {network.architecture.name}: expected weights of {kind}, start.method")
+    return network, known.variant if known is not None else read.metadata.get("variant", "")
 
 
 @once
