@@ -159,10 +159,10 @@ class PoseEstimate:
     """How likely the pose is right to 5 cm and 2 deg, 0..1, from its covariance and fit: to gate on and to rank by."""
     agreement: float = float("nan")
     """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
-    estimated_fx_px: tuple[float | None, float | None] = (None, None)
-    """Focal lengths of source and target where they are a network's estimate; None = the intrinsics were given."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: depth (the network's), reconstruct, initialise, align."""
+    estimated_fx_px: tuple[float | None, float | None] = (None, None)
+    """Focal lengths of source and target where they are a network's estimate; None = the intrinsics were given."""
 
     @property
     def ok(self) -> bool:

@@ -37,9 +37,8 @@ def framed(rgb, depth, index, side="source", library="rosbags", frame_id=None, *
     info = camera_info(library, (rgb.shape[1], rgb.shape[0]), D=[0] * 5, model="plumb_bob", **head, **calibration)
     encoding = "32FC1" if depth.dtype == np.float32 else "16UC1"
     topics = CameraTopics(f"/{side}/image", f"/{side}/camera_info", f"/{side}/depth")
-    return Frame(
-        topics, head["stamp_ns"], image(rgb, "rgb8", library, **head), image(depth, encoding, library, **head), info
-    )
+    images = image(rgb, "rgb8", library, **head), image(depth, encoding, library, **head)
+    return Frame(topics, head["stamp_ns"], *images, info)
 
 
 def frame(index, side="source", **more):
@@ -382,13 +381,10 @@ def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
 
 
-@pytest.mark.parametrize(
-    ("origin", "told"),
-    [("features", "features contradict it"), ("mast3r", "mast3r contradicts it"), (None, "converged")],
-)
-def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch, origin, told):
-    start = origin and Prior(np.eye(4), np.eye(6), origin)
-    answering(monkeypatch, lambda source, target: replace(recordings.estimate(source, target), initial=start))
+@pytest.mark.parametrize("told", ["features contradict it", "mast3r contradicts it"])
+def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch, told):
+    start = Prior(np.eye(4), COVARIANCE, told.split()[0])
+    answering(monkeypatch, lambda *views: replace(recordings.estimate(*views), initial=start))
     assert solve(*pair(), prior=given("target_optical")).prior == f"not used: {told}"
 
 
