@@ -375,8 +375,7 @@ def test_clouds_are_made_when_asked_for_and_when_there_is_a_pose(monkeypatch, ca
 
 def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     answering(monkeypatch, lambda s, t: recordings.estimate(s, t, bad=(3,) if recordings.index_of(t) == 1 else ()))
-    by = Solver(print)
-    follow(by, (1, 2))
+    follow(by := Solver(print), (1, 2))
     result = solve(frame(3), settings=KEYFRAME, by=by, clouds=True)
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
 
@@ -394,8 +393,8 @@ def test_frame_names_that_cannot_be_right_are_doubted(calls):
     assert "frame_id 'source_optical', ''" in doubt and "set source_frame and target_frame" in doubt
     (doubt,) = solve(frame(1), frame(1, "target", frame_id="source_optical")).doubts
     assert "topics name the frames" in doubt
-    named = replace(SETTINGS, source_frame="a", target_frame="b")
-    assert solve(frame(1), frame(1, "target", frame_id=""), settings=named).doubts == []
-    foreign = replace(frame(1, "target"), info=camera_info(D=[0] * 5, model="plumb_bob", frame_id="other"))
-    (doubt,) = solve(frame(1), foreign).doubts
+    named = {"settings": replace(SETTINGS, source_frame="a", target_frame="b")}
+    assert solve(frame(1), frame(1, "target", frame_id=""), **named).doubts == []
+    other = camera_info(D=[0] * 5, model="plumb_bob", frame_id="other")
+    (doubt,) = solve(frame(1), replace(frame(1, "target"), info=other)).doubts
     assert doubt.startswith("/target/image: camera_info is of frame 'other'")
