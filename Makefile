@@ -28,7 +28,8 @@ test: $(VENV)/.test
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
-	$(PY) -m pytest -n 2 --dist loadfile --cov --cov-report=term  # a file at a time: tests of the node mostly wait
+	# a file at a time: tests of the node mostly wait; one thread each: two on two cores would wait for each other
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile --cov --cov-report=term
 
 bench: $(VENV)/.test
 	$(PY) -m bench.speed

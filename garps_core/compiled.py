@@ -133,8 +133,10 @@ def evaluated(
                 turned += e * total[3 * ROWS + r] + f * total[4 * ROWS + r] + i * total[5 * ROWS + r]
                 w[(3 + plane) * ROWS + r] = turned
         _sum_partners(w, total, begin, rows, partners, covariances, log_weights, floor)
+        for r in range(rows):  # into scratch: how a sum is ordered must not depend on where in memory the input lies
+            share[r] = weights[begin + r]
         for r in range(rows):
-            s, weight = np.float64(total[r]), np.float64(weights[begin + r])
+            s, weight = np.float64(total[r]), share[r]
             value += weight * logarithm(total[r])
             share[r] = weight / (1 + s)
             support += share[r] * s
