@@ -38,6 +38,18 @@ def no_network():
 
 
 @pytest.fixture(scope="module")
+def one_thread():
+    """Torch with one thread, as in the node: several wait for each other on a busy machine, and sum in other orders."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.exp(torch.zeros(1))  # the first large one of a process may be wrong
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
 def domain(tmp_path_factory):
     """A ROS domain that nobody else on this machine uses, for the tests of one file."""
     from graph import private_domain

@@ -10,7 +10,6 @@ from pathlib import Path
 import calm_network
 import numpy as np
 import pytest
-import torch
 from graph import NodeProcess, room_pair
 from node_rig import Rig, assert_equal, finding, offline, running, values
 from point_map_cases import Errors, point_maps, true_views
@@ -31,14 +30,6 @@ def with_weights(domain, folder, **more):
 @pytest.fixture(scope="module")
 def networked(domain, tmp_path_factory):
     return with_weights(domain, calm_network.install(tmp_path_factory.mktemp("weights")))
-
-
-@pytest.fixture
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)  # as the node: sums in the same order
-    yield
-    torch.set_num_threads(before)
 
 
 def words(*settings):

@@ -33,12 +33,7 @@ BY_PAIR = {"reconstruction.method": "two_view", "alignment.depth_errors": True}
 Captured = pytest.CaptureFixture[str]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -25,14 +25,7 @@ SIDE = 128
 PICTURES = {"a": image(60, 80), "b": image(60, 80, 16, 8, "image2"), "tall": image(80, 50), "large": image(150, 200, 9)}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Threads that wait for each other on a shared machine cost more than they bring."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.exp(torch.zeros(1))  # the first large one of a process may be wrong
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

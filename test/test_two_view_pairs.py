@@ -5,7 +5,6 @@ import json
 import logging
 import os
 from argparse import Namespace
-from collections.abc import Iterator
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -33,14 +32,7 @@ Captured = pytest.CaptureFixture[str]
 Files = dict[str, str]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Threads that wait for each other on a shared machine cost more than they bring."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.exp(torch.zeros(1))  # the first large one of a process may be wrong
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small depth network to be trained on generated rooms alone (`bench.train_depth`): for demonstrations and tests.
+
+A picture of any size is brought to 192x256 pixels. Beside its colours the network gets the slopes x/z and y/z of every
+pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from garps_core.checks import Float32Array
+from garps_core.types import View
+
+HEIGHT, WIDTH = 192, 256
+"""Pixels of the network's input; its answer has half as many a side."""
+CHANNELS = (24, 32, 64, 96, 128)
+"""Of the maps at 1/2, 1/4 ... 1/32 of the input."""
+BLOCKS = (0, 2, 2, 2, 1)
+"""Residual blocks at each of them."""
+MEAN, DEVIATION = 0.45, 0.25
+"""Of the colours, 0..1."""
+UNIT_FOCAL_PX = 220.0
+"""A focal length that counts as 1, in pixels of the input."""
+
+
+class Unit(nn.Sequential):
+    """Convolution, batch norm (in training; folded into the convolution for use) and ReLU."""
+
+    def __init__(self, inside: int, outside: int, stride: int = 1, kernel: int = 3, norm: bool = False) -> None:
+        super().__init__(
+            nn.Conv2d(inside, outside, kernel, stride, kernel // 2, bias=not norm),
+            nn.BatchNorm2d(outside) if norm else nn.Identity(),
+            nn.ReLU(inplace=True),
+        )
+
+
+class Residual(nn.Module):
+    """Two convolutions, added to what came in."""
+
+    def __init__(self, width: int, norm: bool) -> None:
+        super().__init__()
+        self.first, self.second = Unit(width, width, norm=norm), Unit(width, width, norm=norm)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, h, w) -> (B, C, h, w)."""
+        added: Tensor = x + self.second(self.first(x))
+        return added
+
+
+class DemoNet(nn.Module):
+    """Five levels down, four up, each with what was seen on the way down; at the bottom every place sees the whole."""
+
+    def __init__(self, norm: bool = False) -> None:
+        super().__init__()
+        into = (5, *CHANNELS[:-1])
+        self.down = nn.ModuleList(
+            nn.Sequential(Unit(i, o, 2, norm=norm), *(Residual(o, norm) for _ in range(n)))
+            for i, o, n in zip(into, CHANNELS, BLOCKS, strict=True)
+        )
+        self.whole = nn.Sequential(nn.Linear(CHANNELS[-1], CHANNELS[-1]), nn.ReLU(inplace=True))
+        ways = list(zip(CHANNELS[:0:-1], CHANNELS[-2::-1], strict=True))
+        self.narrow = nn.ModuleList(Unit(i, o, kernel=1, norm=norm) for i, o in ways)
+        self.up = nn.ModuleList(Residual(o, norm) if o > CHANNELS[0] else Unit(o, o, norm=norm) for _, o in ways)
+        self.answer = nn.Conv2d(CHANNELS[0], 1, 3, padding=1)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        """(B, 5, 192, 256) of `prepared` -> logarithm of depth (m) over focal length (as the unit), (B, 96, 128)."""
+        maps = []
+        x = picture
+        for level in self.down:
+            x = level(x)
+            maps.append(x)
+        x = x + self.whole(x.mean((2, 3)))[..., None, None]
+        for narrow, up, skip in zip(self.narrow, self.up, maps[-2::-1], strict=True):
+            x = up(F.interpolate(narrow(x), skip.shape[-2:], mode="bilinear", align_corners=False) + skip)
+        logarithm: Tensor = self.answer(x)[:, 0]
+        return logarithm
+
+
+def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
+    """HxWx3 uint8 and 3x3 K (pixel centres at integers) -> input (5, 192, 256), and the focal length as the unit."""
+    height, width = rgb.shape[:2]
+    scale_x, scale_y = WIDTH / width, HEIGHT / height
+    shrinks = scale_x < 1 or scale_y < 1
+    colours = cv2.resize(rgb, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    fx, fy = K[0, 0] * scale_x, K[1, 1] * scale_y
+    cx, cy = (K[0, 2] + 0.5) * scale_x - 0.5, (K[1, 2] + 0.5) * scale_y - 0.5
+    found = np.empty((5, HEIGHT, WIDTH), np.float32)
+    found[:3] = (colours.transpose(2, 0, 1) / np.float32(255) - np.float32(MEAN)) / np.float32(DEVIATION)
+    found[3] = (np.arange(WIDTH) - cx) / fx
+    found[4] = ((np.arange(HEIGHT) - cy) / fy)[:, None]
+    return found, float(np.sqrt(fx * fy) / UNIT_FOCAL_PX)
+
+
+def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass."""
+    inputs, focals = zip(*(prepared(view.rgb, view.K) for view in views), strict=True)
+    device = next(network.parameters()).device
+    with torch.inference_mode():
+        logarithms = network(torch.from_numpy(np.stack(inputs)).to(device)).float().cpu().numpy()
+    return [
+        np.asarray(cv2.resize(np.exp(one) * np.float32(focal), view.rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR))
+        for one, focal, view in zip(logarithms, focals, views, strict=True)
+    ]

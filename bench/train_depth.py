@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train the demonstration depth network (`bench.demo_net.py`) on generated rooms, on a CPU.
+
+    python -m bench.depth_data                 # the rooms, once: about 50 minutes on two cores
+    python -m bench.train_depth                # two hours on two cores; goes on where it was stopped
+    python -m bench.train_depth --steps 200    # a try
+
+Every step is drawn from its own number and the seed, so that a training that was stopped and resumed is the same as one
+that was not. Pictures are cropped, mirrored and recoloured; a crop changes the intrinsics, which the network is told.
+The last weights are averaged over steps, batch norms folded into convolutions, and written as float16.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from bench.demo_net import HEIGHT, WIDTH, DemoNet, Unit, prepared
+from bench.depth_data import FIRST_SEED, FOLDER, VERSION, render
+from bench.tables import machine_facts
+from garps_core.models.files import write_tensors
+
+HELD_OUT_SEED = 90_000
+"""First seed of the rooms that only measure."""
+BATCH = 16
+RATE, DECAY = 2e-3, 1e-2
+WARM_UP = 300
+"""Steps of a rising rate, which then falls as a cosine to nothing."""
+AVERAGE = 0.998
+"""Of the running mean of the weights, per step."""
+SMALLEST_CROP = 0.65
+STRETCH = 0.15
+"""A crop's sides are scaled apart by up to this (logarithm), as pictures of other shapes are."""
+SLOPES_WEIGHT = 0.5
+"""Of the differences between neighbours, against that of the values."""
+SAVE_EVERY = 200
+
+Picture = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Input (5, 192, 256), logarithm of depth over focal length (96, 128), NaN where unknown, and that focal length."""
+
+    seen: npt.NDArray[np.float32]
+    wanted: npt.NDArray[np.float32]
+    focal: float
+
+
+class Pictures:
+    """All pictures of a folder of rooms, in memory."""
+
+    def __init__(self, folder: Path, seeds: range) -> None:
+        paths = [path for seed in seeds if (path := folder / f"room{seed}_v{VERSION}.npz").is_file()]
+        if not paths:
+            raise typer.BadParameter(
+                f"no rooms of seeds {seeds} in {folder}: run python -m bench.depth_data --out {folder}"
+            )
+        files = [np.load(path, allow_pickle=False) for path in paths]
+        self.rgb, self.depth, self.K = (
+            np.concatenate([file[name] for file in files]) for name in ("rgb", "depth", "K")
+        )
+        self.rooms = len(paths)
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def whole(self, index: int) -> Sample:
+        """A picture as it is."""
+        return _sample(self.rgb[index], self.depth[index], self.K[index])
+
+    def drawn(self, index: int, rng: np.random.Generator) -> Sample:
+        """A picture, changed at random."""
+        rgb, depth, K = self.rgb[index], self.depth[index], self.K[index].copy()
+        if rng.random() < 0.5:
+            rgb, depth = rgb[:, ::-1], depth[:, ::-1]
+            K[0, 2] = rgb.shape[1] - 1 - K[0, 2]
+        size = rng.uniform(SMALLEST_CROP, 1.0) * np.exp(rng.uniform(-STRETCH, STRETCH, 2))
+        rows, columns = (int(side * min(part, 1.0)) for side, part in zip(rgb.shape[:2], size, strict=True))
+        top, left = (
+            int(rng.integers(whole - part + 1)) for whole, part in zip(rgb.shape[:2], (rows, columns), strict=True)
+        )
+        K[:2, 2] -= left, top
+        part = slice(top, top + rows), slice(left, left + columns)
+        return _sample(recoloured(rgb[part], rng), depth[part], K)
+
+
+def recoloured(rgb: Picture, rng: np.random.Generator) -> Picture:
+    """Another exposure, contrast, white balance and a little noise."""
+    x = (rgb / np.float32(255)) ** np.float32(np.exp(rng.normal(0, 0.2)))
+    x = x * np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.05, 3)).astype(np.float32)
+    if rng.random() < 0.3:
+        x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.2)))
+    x = x + rng.normal(0, rng.uniform(0, 0.02), x.shape).astype(np.float32)
+    return np.clip(np.rint(255 * x), 0, 255).astype(np.uint8)
+
+
+def _sample(rgb: Picture, depth_mm: npt.NDArray[np.uint16], K: npt.NDArray[np.float64]) -> Sample:
+    seen, focal = prepared(np.ascontiguousarray(rgb), K)
+    small = cv2.resize(depth_mm, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_NEAREST).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        wanted = np.where(small > 0, np.log(small / 1000 / focal), np.nan)
+    return Sample(seen, wanted.astype(np.float32), focal)
+
+
+def loss_of(found: Tensor, wanted: Tensor) -> Tensor:
+    """Mean error of the logarithm, and of its differences between pixels 1, 2, 4 and 8 apart; (B, h, w) each."""
+    known = wanted.isfinite()
+    off = torch.where(known, found - wanted, 0.0)
+    total = off.abs().sum() / known.sum().clamp_min(1)
+    for step in (1, 2, 4, 8):
+        for a, b in (
+            ((..., slice(step, None)), (..., slice(None, -step))),
+            ((..., slice(step, None), slice(None)), (..., slice(None, -step), slice(None))),
+        ):
+            both = known[a] & known[b]
+            total = total + SLOPES_WEIGHT / 4 * (((off[a] - off[b]).abs() * both).sum() / both.sum().clamp_min(1))
+    return total
+
+
+def batches(pictures: Pictures, first: int, steps: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Inputs and wanted outputs of every step from `first` on, drawn one step ahead in another thread."""
+
+    def drawn(step: int) -> tuple[Tensor, Tensor]:
+        rng = np.random.default_rng([seed, step])
+        samples = [pictures.drawn(int(i), rng) for i in rng.integers(len(pictures), size=BATCH)]
+        return (
+            torch.from_numpy(np.stack([one.seen for one in samples])),
+            torch.from_numpy(np.stack([one.wanted for one in samples])),
+        )
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = pool.submit(drawn, first)
+        for step in range(first, steps):
+            ready, ahead = ahead.result(), pool.submit(drawn, step + 1)
+            yield ready
+
+
+def rate_at(step: int, steps: int) -> float:
+    """Learning rate."""
+    if step < WARM_UP:
+        return RATE * (step + 1) / WARM_UP
+    return RATE * 0.5 * (1 + math.cos(math.pi * (step - WARM_UP) / max(steps - WARM_UP, 1)))
+
+
+@dataclass
+class Training:
+    """Network, its averaged copy, optimiser and the step they are at."""
+
+    network: DemoNet
+    averaged: DemoNet
+    optimiser: torch.optim.Optimizer
+    step: int = 0
+
+    @classmethod
+    def begun(cls, seed: int) -> Training:
+        """From random weights."""
+        torch.manual_seed(seed)
+        network = DemoNet(norm=True).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        averaged = copy.deepcopy(network).requires_grad_(False)
+        return cls(network, averaged, torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY))
+
+    def save(self, path: Path) -> None:
+        """All of it, whole or not at all."""
+        parts = {name: getattr(self, name).state_dict() for name in ("network", "averaged", "optimiser")}
+        unfinished = path.with_suffix(".unfinished")
+        torch.save(parts | {"step": self.step}, unfinished)
+        unfinished.replace(path)
+
+    def resume(self, path: Path) -> None:
+        """Go on from what `save` has written."""
+        kept = torch.load(path, weights_only=True)
+        for name in ("network", "averaged", "optimiser"):
+            getattr(self, name).load_state_dict(kept[name])
+        self.step = kept["step"]
+
+    def take(self, seen: Tensor, wanted: Tensor, steps: int) -> float:
+        """One step; returns the loss."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate_at(self.step, steps)
+        loss = loss_of(self.network(seen.contiguous(memory_format=torch.channels_last)), wanted)
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimiser.step()
+        keep = min(AVERAGE, (self.step + 1) / (self.step + 10))
+        for mean, now in zip(self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True):
+            mean.lerp_(now, 1 - keep) if mean.is_floating_point() else mean.copy_(now)
+        self.step += 1
+        return float(loss.detach())
+
+
+def folded(network: DemoNet) -> DemoNet:
+    """The same function without batch norms."""
+    plain = copy.deepcopy(network).eval()
+    for unit in [module for module in plain.modules() if isinstance(module, Unit)]:
+        unit[0], unit[1] = fuse_conv_bn_eval(unit[0], unit[1]), nn.Identity()
+    return plain
+
+
+def measured(network: nn.Module, pictures: Pictures) -> dict[str, float]:
+    """AbsRel and the share of pixels within a factor of 1.25, means over pictures; and AbsRel with the scale given."""
+    network.eval()
+    rows = []
+    for i in range(0, len(pictures), BATCH):
+        samples = [pictures.whole(j) for j in range(i, min(i + BATCH, len(pictures)))]
+        with torch.inference_mode():
+            found = network(torch.from_numpy(np.stack([one.seen for one in samples]))).numpy()
+        for one, ours in zip(samples, found, strict=True):
+            off = (ours - one.wanted)[np.isfinite(one.wanted)]
+            centred = off - np.median(off)
+            rows.append(
+                [np.abs(np.expm1(off)).mean(), (np.abs(off) < math.log(1.25)).mean(), np.abs(np.expm1(centred)).mean()]
+            )
+    return dict(zip(("AbsRel", "delta<1.25", "AbsRel, scale given"), np.mean(rows, axis=0).tolist(), strict=True))
+
+
+def main(
+    data: Annotated[Path, typer.Option(help="folder of the rooms")] = FOLDER,
+    rooms: Annotated[int, typer.Option(help="to learn from; those that are there")] = 1200,
+    held_out: Annotated[int, typer.Option(help="rooms to measure on; rendered if they are not there")] = 20,
+    steps: Annotated[int, typer.Option(min=1, help=f"of {BATCH} pictures")] = 12_000,
+    seed: Annotated[int, typer.Option(help="of weights and pictures")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    out: Annotated[Path, typer.Option(help="checkpoint, log and weights")] = Path("out/train_depth"),
+) -> None:
+    """Train the demonstration depth network."""
+    torch.set_num_threads(threads)
+    out.mkdir(parents=True, exist_ok=True)
+    data.mkdir(parents=True, exist_ok=True)
+    console, checkpoint = Console(), out / "checkpoint.pt"
+    pictures = Pictures(data, range(FIRST_SEED, FIRST_SEED + rooms))
+    unseen = range(HELD_OUT_SEED, HELD_OUT_SEED + held_out)
+    for other in unseen:
+        render(other, data)
+    judged = Pictures(data, unseen)
+    console.print(
+        f"{len(pictures)} pictures of {pictures.rooms} rooms; measured on {len(judged)} of {judged.rooms} others"
+    )
+    training = Training.begun(seed)
+    if checkpoint.is_file():
+        training.resume(checkpoint)
+        console.print(f"resumed at step {training.step}")
+    _train(training, pictures, steps, seed, checkpoint, out / "log.jsonl")
+    plain = folded(training.averaged)
+    found = measured(plain, judged)
+    facts: dict[str, Any] = machine_facts() | {"steps": steps, "rooms": pictures.rooms, "seed": seed} | found
+    halved = {name: value.half().contiguous() for name, value in plain.state_dict().items()}
+    write_tensors(out / "demo_net.safetensors", halved, {name: str(value) for name, value in facts.items()})
+    (out / "facts.json").write_text(json.dumps(facts, indent=1))
+    console.print(found)
+
+
+def _train(training: Training, pictures: Pictures, steps: int, seed: int, checkpoint: Path, log: Path) -> None:
+    begin, recent = time.monotonic(), 0.0
+    with Progress() as bars, log.open("a", encoding="utf-8") as lines:
+        bar = bars.add_task("steps", total=steps, completed=training.step)
+        for seen, wanted in batches(pictures, training.step, steps, seed):
+            training.network.train()
+            loss = training.take(seen, wanted, steps)
+            recent = loss if recent == 0 else 0.98 * recent + 0.02 * loss
+            bars.update(bar, completed=training.step, description=f"steps, loss {recent:.3f}")
+            if training.step % SAVE_EVERY == 0 or training.step == steps:
+                training.save(checkpoint)
+                line = {"step": training.step, "loss": round(recent, 4), "s": round(time.monotonic() - begin)}
+                lines.write(json.dumps(line) + "\n")
+                lines.flush()
+
+
+if __name__ == "__main__":
+    typer.run(main)
