@@ -30,6 +30,7 @@ setup(
     packages=find_packages(
         include=["garps_ros", "garps_ros.*", "garps_core", "garps_core.*", "msg_adapters", "msg_adapters.*"]
     ),
+    package_data={"garps_core.models": ["demo_net.safetensors"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),

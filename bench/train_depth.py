@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the demonstration depth network (`bench.demo_net.py`) on generated rooms, on a CPU.
+"""Train the demonstration depth network (`garps_core/models/demo_net.py`) on generated rooms, on a CPU.
 
-    python -m bench.depth_data                 # the rooms, once: about 50 minutes on two cores
-    python -m bench.train_depth                # two hours on two cores; goes on where it was stopped
+    python -m bench.depth_data                 # the rooms, once
+    python -m bench.train_depth                # goes on where it was stopped
     python -m bench.train_depth --steps 200    # a try
 
 Every step is drawn from its own number and the seed, so that a training that was stopped and resumed is the same as one
@@ -32,9 +32,10 @@ from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bench.demo_net import HEIGHT, WIDTH, DemoNet, Unit, prepared
 from bench.depth_data import FIRST_SEED, FOLDER, VERSION, render
+from bench.depth_errors import DepthErrors, depth_errors
 from bench.tables import machine_facts
+from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, Unit, prepared
 from garps_core.models.files import write_tensors
 
 HELD_OUT_SEED = 90_000
@@ -50,6 +51,8 @@ STRETCH = 0.15
 """A crop's sides are scaled apart by up to this (logarithm), as pictures of other shapes are."""
 SLOPES_WEIGHT = 0.5
 """Of the differences between neighbours, against that of the values."""
+MAX_RELIEF = 0.03
+"""Neighbouring depths that differ by more lie on two surfaces."""
 SAVE_EVERY = 200
 
 Picture = npt.NDArray[np.uint8]
@@ -73,10 +76,11 @@ class Pictures:
             raise typer.BadParameter(
                 f"no rooms of seeds {seeds} in {folder}: run python -m bench.depth_data --out {folder}"
             )
-        files = [np.load(path, allow_pickle=False) for path in paths]
-        self.rgb, self.depth, self.K = (
-            np.concatenate([file[name] for file in files]) for name in ("rgb", "depth", "K")
-        )
+        first = _arrays(paths[0])
+        self.rgb, self.depth, self.K = (np.empty((len(paths), *one.shape), one.dtype) for one in first)
+        for i, path in enumerate(paths):
+            self.rgb[i], self.depth[i], self.K[i] = _arrays(path)
+        self.rgb, self.depth, self.K = (all_.reshape(-1, *all_.shape[2:]) for all_ in (self.rgb, self.depth, self.K))
         self.rooms = len(paths)
 
     def __len__(self) -> int:
@@ -102,22 +106,39 @@ class Pictures:
         return _sample(recoloured(rgb[part], rng), depth[part], K)
 
 
+def _arrays(path: Path) -> tuple[npt.NDArray[Any], ...]:
+    with np.load(path, allow_pickle=False) as file:
+        return tuple(file[name] for name in ("rgb", "depth", "K"))
+
+
 def recoloured(rgb: Picture, rng: np.random.Generator) -> Picture:
     """Another exposure, contrast, white balance and a little noise."""
-    x = (rgb / np.float32(255)) ** np.float32(np.exp(rng.normal(0, 0.2)))
-    x = x * np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.05, 3)).astype(np.float32)
+    curve = (np.arange(256) / 255) ** np.exp(rng.normal(0, 0.2))
+    gains = np.exp(rng.normal(0, 0.15) + rng.normal(0, 0.05, 3))
+    x = cv2.LUT(rgb, (curve[:, None] * gains).astype(np.float32)[None])
     if rng.random() < 0.3:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.2)))
-    x = x + rng.normal(0, rng.uniform(0, 0.02), x.shape).astype(np.float32)
+    x = x + np.float32(rng.uniform(0, 0.02)) * rng.standard_normal(x.shape, np.float32)
     return np.clip(np.rint(255 * x), 0, 255).astype(np.uint8)
 
 
 def _sample(rgb: Picture, depth_mm: npt.NDArray[np.uint16], K: npt.NDArray[np.float64]) -> Sample:
     seen, focal = prepared(np.ascontiguousarray(rgb), K)
-    small = cv2.resize(depth_mm, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_NEAREST).astype(np.float32)
+    return Sample(seen, np.log(shrunk(depth_mm) / np.float32(focal)), focal)
+
+
+def shrunk(depth_mm: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+    """Depth in the size of the network's answer, m, NaN where unknown.
+
+    Inverse depth, linear in the pixel on a plane, is interpolated; at edges the nearest pixel is taken.
+    """
+    size = WIDTH // 2, HEIGHT // 2
     with np.errstate(divide="ignore"):
-        wanted = np.where(small > 0, np.log(small / 1000 / focal), np.nan)
-    return Sample(seen, wanted.astype(np.float32), focal)
+        inverse = np.where(depth_mm > 0, np.float32(1000) / depth_mm, np.float32(np.nan))
+    nearest = cv2.resize(inverse, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    between = cv2.resize(inverse, size, interpolation=cv2.INTER_LINEAR)
+    on_a_surface = np.abs(between - nearest) < MAX_RELIEF * nearest
+    return np.asarray(1 / np.where(on_a_surface, between, nearest), np.float32)
 
 
 def loss_of(found: Tensor, wanted: Tensor) -> Tensor:
@@ -191,11 +212,13 @@ class Training:
             getattr(self, name).load_state_dict(kept[name])
         self.step = kept["step"]
 
-    def take(self, seen: Tensor, wanted: Tensor, steps: int) -> float:
+    def take(self, seen: Tensor, wanted: Tensor, steps: int, bfloat16: bool = False) -> float:
         """One step; returns the loss."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate_at(self.step, steps)
-        loss = loss_of(self.network(seen.contiguous(memory_format=torch.channels_last)), wanted)
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            found = self.network(seen.contiguous(memory_format=torch.channels_last))
+        loss = loss_of(found.float(), wanted)
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -218,27 +241,24 @@ def folded(network: DemoNet) -> DemoNet:
 def measured(network: nn.Module, pictures: Pictures) -> dict[str, float]:
     """AbsRel and the share of pixels within a factor of 1.25, means over pictures; and AbsRel with the scale given."""
     network.eval()
-    rows = []
+    rows: list[DepthErrors] = []
     for i in range(0, len(pictures), BATCH):
         samples = [pictures.whole(j) for j in range(i, min(i + BATCH, len(pictures)))]
         with torch.inference_mode():
             found = network(torch.from_numpy(np.stack([one.seen for one in samples]))).numpy()
-        for one, ours in zip(samples, found, strict=True):
-            off = (ours - one.wanted)[np.isfinite(one.wanted)]
-            centred = off - np.median(off)
-            rows.append(
-                [np.abs(np.expm1(off)).mean(), (np.abs(off) < math.log(1.25)).mean(), np.abs(np.expm1(centred)).mean()]
-            )
-    return dict(zip(("AbsRel", "delta<1.25", "AbsRel, scale given"), np.mean(rows, axis=0).tolist(), strict=True))
+        rows += [depth_errors(np.exp(ours), np.exp(one.wanted)) for one, ours in zip(samples, found, strict=True)]
+    mean = DepthErrors(*np.mean(rows, axis=0).tolist())
+    return {"AbsRel": mean.abs_rel, "delta<1.25": mean.delta, "AbsRel, scale given": mean.shape}
 
 
 def main(
     data: Annotated[Path, typer.Option(help="folder of the rooms")] = FOLDER,
-    rooms: Annotated[int, typer.Option(help="to learn from; those that are there")] = 1200,
+    rooms: Annotated[int, typer.Option(help="to learn from; those that are there")] = 1000,
     held_out: Annotated[int, typer.Option(help="rooms to measure on; rendered if they are not there")] = 20,
-    steps: Annotated[int, typer.Option(min=1, help=f"of {BATCH} pictures")] = 12_000,
+    steps: Annotated[int, typer.Option(min=1, help=f"of {BATCH} pictures")] = 10_000,
     seed: Annotated[int, typer.Option(help="of weights and pictures")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="of torch")] = 2,
+    bfloat16: Annotated[bool, typer.Option(help="convolve in it: faster on processors that can")] = False,
     out: Annotated[Path, typer.Option(help="checkpoint, log and weights")] = Path("out/train_depth"),
 ) -> None:
     """Train the demonstration depth network."""
@@ -258,23 +278,27 @@ def main(
     if checkpoint.is_file():
         training.resume(checkpoint)
         console.print(f"resumed at step {training.step}")
-    _train(training, pictures, steps, seed, checkpoint, out / "log.jsonl")
+    _train(training, pictures, steps, seed, bfloat16, checkpoint, out / "log.jsonl")
     plain = folded(training.averaged)
     found = measured(plain, judged)
-    facts: dict[str, Any] = machine_facts() | {"steps": steps, "rooms": pictures.rooms, "seed": seed} | found
+    facts: dict[str, Any] = machine_facts()
+    facts |= {"steps": steps, "rooms": pictures.rooms, "seed": seed, "bfloat16": bfloat16}
+    facts |= found
     halved = {name: value.half().contiguous() for name, value in plain.state_dict().items()}
     write_tensors(out / "demo_net.safetensors", halved, {name: str(value) for name, value in facts.items()})
     (out / "facts.json").write_text(json.dumps(facts, indent=1))
     console.print(found)
 
 
-def _train(training: Training, pictures: Pictures, steps: int, seed: int, checkpoint: Path, log: Path) -> None:
+def _train(
+    training: Training, pictures: Pictures, steps: int, seed: int, bfloat16: bool, checkpoint: Path, log: Path
+) -> None:
     begin, recent = time.monotonic(), 0.0
     with Progress() as bars, log.open("a", encoding="utf-8") as lines:
         bar = bars.add_task("steps", total=steps, completed=training.step)
         for seen, wanted in batches(pictures, training.step, steps, seed):
             training.network.train()
-            loss = training.take(seen, wanted, steps)
+            loss = training.take(seen, wanted, steps, bfloat16)
             recent = loss if recent == 0 else 0.98 * recent + 0.02 * loss
             bars.update(bar, completed=training.step, description=f"steps, loss {recent:.3f}")
             if training.step % SAVE_EVERY == 0 or training.step == steps:

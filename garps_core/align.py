@@ -18,7 +18,7 @@ from garps_core.geometry import Array
 from garps_core.initialise import identity, initialise
 from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
 from garps_core.photometric import sharpen
-from garps_core.reconstruct import mixtures_of, with_depth
+from garps_core.reconstruct import depth_origin, mixtures_of, with_depth
 from garps_core.search import search
 from garps_core.solve import MIN_ROWS, Belief, Solution
 from garps_core.systematic import DEPTH_MODES, shared_sigmas
@@ -58,7 +58,8 @@ def estimate_with_mixtures(
     """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
     estimate, mixtures = _estimated(source, target, config or Config(), prior)
     focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
-    return replace(estimate, estimated_fx_px=(focal[0], focal[1])), mixtures
+    origin = depth_origin((source, target), config or Config())
+    return replace(estimate, estimated_fx_px=(focal[0], focal[1]), depth_from=origin), mixtures
 
 
 def _doubting(config: Config, *views: View) -> Config:
@@ -234,6 +235,9 @@ def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool,
         seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
     if seen is not None and settings.brightness > 0:
         T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)
+    common = config.lifting.common_scale_sigma
     if config.reconstruction.method == "two_view":
-        covariance = _of_one_scale(covariance, T, config.start.network_scale_sigma)
+        common = config.start.network_scale_sigma
+    if common > 0:
+        covariance = _of_one_scale(covariance, T, common)
     return Finding(solution, T, covariance, overlap(x, y, T, settings), seen)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.config import METHODS, PRESETS, STARTS, TWO_VIEW, Config, Reconstruction
+from garps_core.config import METHODS, PRESETS, STARTS, TWO_VIEW, Config, Reconstruction, preset_for
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.files import read_image, read_view
 from garps_core.focal import estimate_intrinsics
@@ -118,15 +118,16 @@ def align(
           --depth-source a_depth.png --depth-target b_depth.png --figure pair.png
       garps align a.png b.png --K 525 525 319.5 239.5        # by a network, see `garps weights`
       garps align a.png b.png --preset mast3r                # nothing else is known
+      garps align a.png b.png --K 525 525 319.5 239.5 --preset demo_net    # no weights: a demonstration
       garps align a.ply b.ply --prior "0.2 0 0 0 0 0 1"      # splats of any producer, metres
     \b
     Exit code: 0 = converged, 1 = no pose to be trusted (the reason is printed), 2 = wrong input.
     """
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
-    preset = preset or ("default" if splats or any(depths) else "monocular")
     options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    config = _configured(preset, set_ or [], options)
+    method = _configured("default", set_ or [], options).reconstruction.method
+    config = _configured(preset or preset_for(method, splats or any(depths)), set_ or [], options)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:

@@ -15,6 +15,7 @@ from garps_core.described import Checked, flattened, replaced, setting
 from garps_core.errors import ConfigError
 
 __all__ = [
+    "DEPTH_NETWORKS",
     "METHODS",
     "PRESETS",
     "SCENES",
@@ -26,9 +27,12 @@ __all__ = [
     "Reconstruction",
     "Rung",
     "Start",
+    "preset_for",
 ]
 
-METHODS = ("auto", "rgbd", "depth_anything_v2", "flash3d", "two_view", "ply")
+METHODS = ("auto", "rgbd", "depth_anything_v2", "demo_net", "flash3d", "two_view", "ply")
+DEPTH_NETWORKS = ("depth_anything_v2", "demo_net")
+"""Of them those that give depth of one image, which is then lifted like a sensor's."""
 TWO_VIEW = ("mast3r", "dust3r", "adapter")
 """Starts by a two-view network."""
 STARTS = ("auto", "features", "identity", *TWO_VIEW)
@@ -41,8 +45,9 @@ class Reconstruction(Checked):
 
     method: str = setting(
         "auto",
-        "rgbd = the sensor's depth; a network; two_view = that of start.method, which then runs once for both; ply = "
-        "mixtures from files; auto = depth_anything_v2 without a sensor",
+        "rgbd = the sensor's depth; a network; demo_net = the one in the package, a demonstration; two_view = that of "
+        "start.method, which then runs once for both; ply = mixtures from files; auto = depth_anything_v2 without a "
+        "sensor",
         choices=METHODS,
         live=False,
     )
@@ -89,6 +94,9 @@ class Lifting(Checked):
     )
     scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
     warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
+    common_scale_sigma: float = setting(
+        0.0, "relative scale error that both depth maps have in common, so that no picture shows it", low=0, high=1
+    )
     pointing_sigma_rad: float = setting(
         5e-4, "error of the direction a pixel looks in (0.25 px at a focal length of 500 px)", unit="rad", low=0, high=1
     )
@@ -243,6 +251,21 @@ def _mast3r() -> Config:
     return _monocular().replace({"start.method": "mast3r", "reconstruction.method": "two_view"})
 
 
+def _demo_net() -> Config:
+    """Two images by the network in the package, a demonstration that knows generated rooms only."""
+    lifting = {"scale_sigma": 0.05, "warp_sigma": 0.04, "common_scale_sigma": 0.05, "noise_linear": 0.03}
+    return _monocular().replace(
+        {"reconstruction.method": "demo_net"} | {f"lifting.{name}": value for name, value in lifting.items()}
+    )
+
+
+def preset_for(method: str, with_depth: bool) -> str:
+    """Name of the preset that goes with `reconstruction.method`, for views that bring depth or do not."""
+    if method == "demo_net":
+        return "demo_net"
+    return "default" if with_depth else "monocular"
+
+
 PRESETS: dict[str, Callable[[], Config]] = {
     "default": Config,
     "sensor": Config,
@@ -251,6 +274,7 @@ PRESETS: dict[str, Callable[[], Config]] = {
     "stereo": _stereo,
     "monocular": _monocular,
     "mast3r": _mast3r,
+    "demo_net": _demo_net,
     "paper": _paper,
     "paper_full": _paper_full,
 }

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """View -> Mixture: from the sensor's depth, from a depth network's, or by Flash3D on either.
 
-    view -> with_depth: the sensor's, Depth Anything V2's of all views in one pass, or that of the two-view network
-            which also gives the initial pose
+    view -> with_depth: the sensor's, a depth network's of all views in one pass, or that of the two-view network which
+            also gives the initial pose
          -> mixture_of: lifted pixel by pixel, or two Gaussians per pixel by Flash3D; labels where asked for
 
 Which, says `config.reconstruction.method`. Networks are loaded once and stay (`models/loaded.py`).
@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from garps_core.checks import Float32Array
-from garps_core.config import TWO_VIEW, Config
+from garps_core.config import DEPTH_NETWORKS, TWO_VIEW, Config
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
 from garps_core.initialise import check_start
 from garps_core.lift import MIN_COMPONENTS, lift
@@ -55,7 +55,7 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     if method == "two_view":
         check_settings(config)
         return _of_pair(views, config)
-    needing = [i for i, view in enumerate(views) if view.depth is None or method == "depth_anything_v2"]
+    needing = [i for i, view in enumerate(views) if view.depth is None or method in DEPTH_NETWORKS]
     if not needing or method == "rgbd":
         return list(views)
     check_settings(config)
@@ -71,6 +71,19 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     for i, depth in zip(needing, depths, strict=True):
         found[i] = _given(views[i], depth)
     return found
+
+
+def depth_origin(views: Sequence[View], config: Config) -> str:
+    """Where `with_depth` takes it from, for people: "given", or the network."""
+    method = config.reconstruction.method
+    if method == "demo_net":
+        from garps_core.models.demo_net import WHAT_IT_IS
+
+        return f"demo_net, {WHAT_IT_IS}"
+    if method == "two_view":
+        return config.start.method
+    there = all(view.depth is not None for view in views)
+    return "given" if method == "rgbd" or (there and method != "depth_anything_v2") else "depth_anything_v2"
 
 
 def _of_pair(views: Sequence[View], config: Config) -> list[View]:

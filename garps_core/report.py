@@ -29,6 +29,7 @@ def as_json(estimate: PoseEstimate) -> dict[str, Any]:
         "overlap": float(estimate.overlap),
         "quality": float(estimate.quality),
         "agreement": float(estimate.agreement) if np.isfinite(estimate.agreement) else None,
+        "depth_from": estimate.depth_from,
         "estimated_fx_px": list(estimate.estimated_fx_px),
         "iterations": int(estimate.iterations),
         "objective": float(estimate.objective) if np.isfinite(estimate.objective) else None,
@@ -68,6 +69,8 @@ def as_text(estimate: PoseEstimate) -> str:
     if estimate.initial is not None:
         why = f" ({estimate.initial.reason})" if estimate.initial.reason else ""
         lines.append(f"start        {estimate.initial.origin}{why}")
+    if estimate.depth_from != "given":
+        lines.append(f"depth        by {estimate.depth_from}")
     if any(estimate.estimated_fx_px):
         told = " and ".join("as given" if fx is None else f"{fx:.1f} px" for fx in estimate.estimated_fx_px)
         lines.append(f"intrinsics   estimated: focal lengths {told}, principal point in the middle")

@@ -17,7 +17,10 @@ from garps_ros.arrivals import MANY_MISSING, Arrivals
 
 WINDOW = 200
 """Results that latencies look back on."""
-WITHOUT_DEPTH = "reconstruction.method:=depth_anything_v2 with preset:=monocular does without depth"
+WITHOUT_DEPTH = (
+    "reconstruction.method:=depth_anything_v2 with preset:=monocular does without depth, and preset:=demo_net shows it "
+    "without weights"
+)
 
 
 class Level(enum.IntEnum):

@@ -12,14 +12,14 @@ import numpy as np
 
 from garps_core import compiled
 from garps_core.align import estimate_relative_pose
-from garps_core.config import TWO_VIEW, Config, Lifting, Reconstruction, Start
+from garps_core.config import DEPTH_NETWORKS, TWO_VIEW, Config, Lifting, Reconstruction, Start
 from garps_core.errors import ConfigError
 from garps_core.initialise import check_start
 from garps_core.reconstruct import check_settings, with_depth
 from garps_core.types import Prior, View
 from garps_ros.tracking import MIN_DEPTH_SHARE
 
-NETWORKS = ("depth_anything_v2", "flash3d", "two_view")
+NETWORKS = (*DEPTH_NETWORKS, "flash3d", "two_view")
 """Methods that ask a network for depth; the others need the sensor's."""
 LONG_S = 2.0
 """Compiled loops that are read from where they were kept take less; more is worth a line."""
@@ -54,7 +54,8 @@ def depth_share(config: Config) -> float:
 
 def settings_of_completed(config: Config) -> Config:
     """The settings for views that are `completed` already: a network's depth then counts as given."""
-    return config.replace({"reconstruction.method": "rgbd"} if config.reconstruction.method == NETWORKS[0] else {})
+    of_network = config.reconstruction.method in DEPTH_NETWORKS
+    return config.replace({"reconstruction.method": "rgbd"} if of_network else {})
 
 
 def scale_from(config: Config) -> str:
@@ -66,6 +67,10 @@ def scale_from(config: Config) -> str:
     settings = config.reconstruction
     if settings.method == "two_view":
         return f"{two_view_name(config)} of every pair, m"
+    if settings.method == "demo_net":
+        from garps_core.models.demo_net import WHAT_IT_IS
+
+        return f"demo_net ({WHAT_IT_IS}), m"
     variant = "" if settings.scene == "any" else settings.scene
     weights = settings.depth_weights or default("depth_anything", variant).name
     found = f"depth_anything_v2 (weights {weights}), m"
@@ -104,7 +109,7 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
         two_view_model(config)
     if not needs_depth(config) and settings.method != "two_view":
         names.append(scale_from(config).removesuffix(", m"))
-        loaded.on_device(loaded.depth_network(settings.depth_weights, settings.scene), config.device)
+        loaded.on_device(loaded.depth_network_of(settings), config.device)
     if settings.method == "flash3d":
         loaded.flash3d(settings.flash3d_weights, config.device)
     if settings.semantics != "none":

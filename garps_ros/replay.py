@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from garps_core.align import estimate_relative_pose
-from garps_core.config import METHODS, PRESETS, Config
+from garps_core.config import METHODS, PRESETS, Config, preset_for
 from garps_core.errors import GarpsError
 from garps_core.settings import changed_config
 from garps_core.types import PoseEstimate, View
@@ -182,7 +182,7 @@ def _configured(preset: str | None, method: str | None, changes: list[str]) -> C
     """The settings; of a network from the preset for its depth, where none is given."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
     with_sensor = needs_depth(changed_config(Config(), changes))
-    config = changed_config(Config.preset(preset or ("default" if with_sensor else "monocular")), changes)
+    config = changed_config(Config.preset(preset or preset_for(method or "", with_sensor)), changes)
     check_method(config)
     return config
 

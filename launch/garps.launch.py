@@ -44,7 +44,7 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     (
         "reconstruction",
         "",
-        ("", "auto", "rgbd", "depth_anything_v2", "flash3d", "two_view"),
+        ("", "auto", "rgbd", "depth_anything_v2", "demo_net", "flash3d", "two_view"),
         "reconstruction.method: auto and rgbd take the depth topics, the others are networks and do without; give them "
         f"preset:=monocular, and two_view a start.method; preset:=mast3r has both; empty: {AS_IN_FILE}",
     ),
@@ -62,6 +62,7 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
             "stereo",
             "monocular",
             "mast3r",
+            "demo_net",
             "paper",
             "paper_full",
         ),

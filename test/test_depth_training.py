@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from bench.demo_net import HEIGHT, WIDTH, DemoNet, depth_of
 from bench.depth_data import shots
 from bench.rooms.shading import camera_rays
 from bench.train_depth import Training, batches, folded, loss_of, rate_at
 from garps_core import View
+from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, depth_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 4

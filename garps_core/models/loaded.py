@@ -15,9 +15,9 @@ import torch
 from torch import nn
 
 from garps_core.checks import Float32Array, IntArray
-from garps_core.config import Config
+from garps_core.config import Config, Reconstruction
 from garps_core.errors import ModelError, ReconstructionError, WeightsError
-from garps_core.models import mask2former, semantics
+from garps_core.models import demo_net, mask2former, semantics
 from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
 from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
@@ -41,10 +41,13 @@ def depths(views: Sequence[View], config: Config) -> list[Float32Array]:
 
     Raises:
         WeightsError: none installed, or not what it should be. ModelError: too little memory, not finite.
+        InputError: a picture too elongated for the network.
         ReconstructionError: most of a picture lies at the end of the network's range.
     """
     settings = config.reconstruction
-    network = on_device(depth_network(settings.depth_weights, settings.scene), config.device)
+    network = on_device(depth_network_of(settings), config.device)
+    if isinstance(network, demo_net.DemoNet):
+        return [depth * np.float32(settings.depth_scale) for depth in demo_net.depth_of(network, views)]
     images = [view.rgb for view in views]
     fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
     found = depth_of(network, images, depth_scale=settings.depth_scale, fx=fx, dtype=dtype_of(config))
@@ -101,12 +104,26 @@ def once(load: Callable[..., Made]) -> Callable[..., Made]:
     return under_lock
 
 
+def depth_network_of(settings: Reconstruction) -> DepthAnythingV2 | demo_net.DemoNet:
+    """The depth network that the settings ask for. Raises WeightsError."""
+    if settings.method == "demo_net":
+        return demonstration()
+    return depth_network(settings.depth_weights, settings.scene)
+
+
 @once
 def depth_network(weights: str, scene: str) -> DepthAnythingV2:
     """Depth Anything V2 from a name, a file or, for "", what is installed; scene = any, indoor or outdoor."""
     variant = "" if scene == "any" else scene
     path, read = tensors_of(weights, "depth_anything", variant)
     return built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
+
+
+@once
+def demonstration() -> demo_net.DemoNet:
+    """The network in the package; that it is a demonstration is told to whoever listens to the log."""
+    LOG.warning("demo_net is %s", demo_net.WHAT_IT_IS)
+    return demo_net.shipped()
 
 
 @once

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small depth network to be trained on generated rooms alone (`bench.train_depth`): for demonstrations and tests.
+"""The demonstration depth network, trained on generated rooms alone and shipped with the package: one image and its
+intrinsics -> depth in metres.
+
+It makes the way from two plain images to a pose run without any download, with errors that are a network's own. Of real
+pictures it knows nothing: docs/demo_net.md has its errors. Nothing chooses it but who asks for it by name.
 
 A picture of any size is brought to 192x256 pixels. Beside its colours the network gets the slopes x/z and y/z of every
-pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell.
+pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell. Trained by
+`python -m bench.train_depth`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.resources import as_file, files
 
 import cv2
 import numpy as np
@@ -17,6 +23,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.checks import Float32Array
+from garps_core.errors import InputError, ModelError
+from garps_core.models.files import read_tensors
+from garps_core.models.loading import load_strictly
 from garps_core.types import View
 
 HEIGHT, WIDTH = 192, 256
@@ -29,6 +38,11 @@ MEAN, DEVIATION = 0.45, 0.25
 """Of the colours, 0..1."""
 UNIT_FOCAL_PX = 220.0
 """A focal length that counts as 1, in pixels of the input."""
+WHAT_IT_IS = "a demonstration: it knows generated rooms only, its depth of real pictures means little"
+FILE = "demo_net.safetensors"
+MAX_BYTES = 6_000_000
+MAX_ASPECT = 3
+"""Of a picture's sides: beyond, nothing like it was ever seen in training."""
 
 
 class Unit(nn.Sequential):
@@ -85,6 +99,15 @@ class DemoNet(nn.Module):
         return logarithm
 
 
+def shipped() -> DemoNet:
+    """The network with the weights of this package, ready to be used. WeightsError where they are not there."""
+    with as_file(files("garps_core.models").joinpath(FILE)) as path:
+        tensors = read_tensors(path, max_bytes=MAX_BYTES).tensors
+    network = DemoNet()
+    load_strictly(network, tensors, "the demonstration network", dtype=torch.float32)
+    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
 def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
     """HxWx3 uint8 and 3x3 K (pixel centres at integers) -> input (5, 192, 256), and the focal length as the unit."""
     height, width = rgb.shape[:2]
@@ -101,12 +124,29 @@ def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Fl
 
 
 def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
-    """Depth of each view, HxW float32 m along z, all in one pass."""
+    """Depth of each view, HxW float32 m along z, all in one pass.
+
+    Raises:
+        InputError: a picture more than `MAX_ASPECT` times as long as wide, or as wide as long.
+        ModelError: depth that is not finite.
+    """
+    for view in views:
+        height, width = view.rgb.shape[:2]
+        if max(height, width) > MAX_ASPECT * min(height, width):
+            raise InputError(f"rgb is {width}x{height}: expected sides within a factor of {MAX_ASPECT} for demo_net")
     inputs, focals = zip(*(prepared(view.rgb, view.K) for view in views), strict=True)
     device = next(network.parameters()).device
     with torch.inference_mode():
         logarithms = network(torch.from_numpy(np.stack(inputs)).to(device)).float().cpu().numpy()
     return [
-        np.asarray(cv2.resize(np.exp(one) * np.float32(focal), view.rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR))
-        for one, focal, view in zip(logarithms, focals, views, strict=True)
+        _enlarged(one, focal, view.rgb.shape[:2]) for one, focal, view in zip(logarithms, focals, views, strict=True)
     ]
+
+
+def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> Float32Array:
+    """Depth in the picture's size: inverse depth is interpolated, which is linear in the pixel on a plane."""
+    inverse = np.exp(-logarithm) / np.float32(focal)
+    depth = np.float32(1) / cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_LINEAR)
+    if not np.isfinite(depth).all():
+        raise ModelError("the depth of demo_net is not finite: expected numbers; is its file what was shipped?")
+    return np.asarray(depth, np.float32)

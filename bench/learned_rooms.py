@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of generated rooms that the demonstration network has not seen, from rich in texture to hardly anything to match.
+
+    python -m bench.learned_rooms
+
+Seeds are not those of the rooms to learn from (`bench.depth_data`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
+35 deg and 1 m) and kinds take turns. Depth is the truth's here; `with_learned_depth` puts the network's in its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from bench.bare import in_the_dark, matches
+from bench.datasets import Pair, scene_points
+from bench.rooms import LEVELS, make_pair
+from garps_core import View
+from garps_core.models.demo_net import DemoNet, depth_of
+
+SET = "learned_rooms"
+FOLDER = Path("out/learned_rooms")
+KINDS = {"rich": 1.0, "medium": 0.4, "plain": 0.0, "dark": 0.0}
+"""Texture of each; dark is plain, in dim light from a moving camera (`bench.bare.in_the_dark`)."""
+SPLITS = {"tune": range(91_000, 91_060), "report": range(92_000, 92_200)}
+VERSION = 1
+
+
+def kind_of(seed: int) -> str:
+    """Every level comes in every kind."""
+    return list(KINDS)[seed // len(LEVELS) % len(KINDS)]
+
+
+def level_of(seed: int) -> int:
+    """Levels take turns."""
+    return sorted(LEVELS)[seed % len(LEVELS)]
+
+
+def load(split: str, folder: Path, console: Console, workers: int = 2) -> list[Pair]:
+    """Pairs of a split with true depth, `category` = kind; made where they are not yet in the folder.
+
+    Raises:
+        ValueError: no such split.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"split is {split!r}: expected one of {', '.join(SPLITS)}")
+    folder.mkdir(parents=True, exist_ok=True)
+    seeds = SPLITS[split]
+    with ProcessPoolExecutor(workers) as pool, Progress(console=console) as bars:
+        paths = pool.map(partial(stored, folder=folder), seeds)
+        return [
+            _read(seed, path)
+            for seed, path in bars.track(
+                zip(seeds, paths, strict=True), total=len(seeds), description=f"{SET}, {split}"
+            )
+        ]
+
+
+def stored(seed: int, folder: Path) -> Path:
+    """The file of one pair, made unless it is there."""
+    path = folder / f"room{seed}_v{VERSION}.npz"
+    if path.is_file():
+        return path
+    made = make_pair(seed, level_of(seed), KINDS[kind_of(seed)])
+    rgbs = [made.rgb0, made.rgb1]
+    if kind_of(seed) == "dark":
+        rgbs = [in_the_dark(rgb, np.random.default_rng([seed, 501, k])) for k, rgb in enumerate(rgbs)]
+    unfinished = path.with_suffix(".unfinished")
+    with unfinished.open("wb") as file:
+        np.savez_compressed(
+            file,
+            rgb=np.stack(rgbs),
+            depth=np.stack([made.true_depth0, made.true_depth1]),
+            K=np.stack([made.K0, made.K1]),
+            T=made.T_1_0,
+        )
+    unfinished.replace(path)
+    return path
+
+
+def _read(seed: int, path: Path) -> Pair:
+    with np.load(path, allow_pickle=False) as file:
+        views = [View(*given) for given in zip(file["rgb"], file["K"], file["depth"], strict=True)]
+        T = file["T"]
+    name = f"room{seed}_level{level_of(seed)}"
+    return Pair(SET, name, kind_of(seed), views[0], views[1], T, scene_points(views[0]))
+
+
+def with_learned_depth(pair: Pair, network: DemoNet) -> Pair:
+    """The pair with the network's depth; `points` stay true."""
+    source, target = depth_of(network, [pair.source, pair.target])
+    return replace(pair, source=replace(pair.source, depth=source), target=replace(pair.target, depth=target))
+
+
+def few_matches(pairs: Sequence[Pair], limit: int) -> int:
+    """How many have fewer matches of features than that."""
+    return sum(matches(pair) < limit for pair in pairs)
+
+
+def main(
+    splits: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(SPLITS)}")] = ",".join(SPLITS),
+    out: Annotated[Path, typer.Option(help="folder of the pairs")] = FOLDER,
+    workers: Annotated[int, typer.Option(min=1, help="processes")] = 2,
+) -> None:
+    """Make the pairs that the demonstration network is measured on."""
+    console = Console()
+    for split in splits.split(","):
+        pairs = load(split, out, console, workers)
+        console.print(f"{split}: {len(pairs)} pairs, {few_matches(pairs, 30)} of them with fewer than 30 matches")
+
+
+if __name__ == "__main__":
+    typer.run(main)
