@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of generated rooms that the demonstration network has not seen, from rich in texture to hardly anything to match.
+"""Pairs of generated rooms that the demonstration network has not seen, rich in texture to hardly anything to match.
 
     python -m bench.learned_rooms
 
