@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.bare import SET as BARE_ROOMS
+from bench.evaluate import START
 from bench.tables import GARPS, Row, coverage, quality_auc, summarise
 
-START = "(start)"
 REGISTRATION = ("open3d-gicp", "open3d-colored", "open3d-plane", "small-gicp", "rgbd-hybrid", "rgbd-intensity")
 BARE_PEERS = ("sift-pnp", "open3d-gicp", "open3d-colored", "kiss-matcher+gicp")
 MONOCULAR_E_3D, MONOCULAR_E_ROT = 0.4, 0.8

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from garps_core.checks import Float32Array, Float64Array, checked_rigid
+from garps_core.checks import Float32Array, Float64Array, IntArray, checked_rigid
 from garps_core.geometry import pixel_rays, skew, transform
 from garps_core.types import Prior, View
 
@@ -50,6 +50,9 @@ class Pair:
         source, target: the two views.
         T_target_source: 4x4, m.
         points: Nx3 m, true scene points in the source frame; they stay true when the views' depth is spoilt.
+        scale: where the unit of the translation comes from: "metres" (measured), "raw" (the set's own arbitrary unit)
+            or "sfm-depth x1.234" (that unit times a factor found from a network's depth).
+        labels: HxW class of every pixel of source and target, where the truth has them.
     """
 
     set: str
@@ -59,6 +62,8 @@ class Pair:
     target: View
     T_target_source: Float64Array
     points: Float64Array
+    scale: str = "metres"
+    labels: tuple[IntArray, IntArray] | None = None
 
 
 def truth_covariance(pair: Pair) -> Float64Array:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m bench.demo`: GARPS on twelve recorded stereo pairs, offline and live, and in a generated room.
+"""`python -m bench.demo`: GARPS on twelve recorded stereo pairs, offline and live, and in generated rooms.
 
 1. Stereo: depth for both cameras by a stereo matcher, written to a rosbag2 as a robot would record it, replayed by
    `garps-replay`. The truth is the calibrated rig: baseline 75 mm, no rotation. (The depth was made with the same
    baseline: what is tested is the alignment, not the depth. The rectification is good to about 0.2 px, 0.03 deg.)
 2. Room: two views 0.6 m and 20 degrees apart with a depth sensor's noise; the truth is exact. Once from the images
    alone, once from a rough pose (0.12 m and 3 degrees off) as odometry would give it; that one is the picture.
-3. Live: `pose_node` in a process of its own, the stereo pairs played into it over ROS 2, its poses as they come.
+3. Two plain images of a generated room, without depth: that comes from the network in the package (`bench.demo_rgb`).
+4. Live: `pose_node` in a process of its own, the stereo pairs played into it over ROS 2, its poses as they come.
    Left out where rclpy is not installed.
 """
 
@@ -31,6 +32,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.demo_bag import stamp_ns_of, write_bag
 from bench.demo_picture import with_inputs
+from bench.demo_rgb import rgb_part
 from bench.rooms import RoomPair, make_pair
 from bench.stereo import StereoPair, depth_of_both, load_pairs
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
@@ -74,6 +76,7 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     good = stereo_part(out, scenes)
     room_part(out)
+    good &= rgb_part(out, console)
     good &= live_part(out, scenes)
     console.print(f"\nEverything is in [bold]{out}[/bold]; {time.perf_counter() - begin:.0f} s.")
     return 0 if good else 1

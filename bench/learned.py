@@ -12,28 +12,29 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
 from bench import learned_rooms
-from bench.acceptance import START, Bar, markdown_bars, print_bars
+from bench.acceptance import Bar, markdown_bars, print_bars
 from bench.bare import MAX_MATCHES
 from bench.baselines import METHODS
 from bench.datasets import Pair, disturbed_prior
 from bench.depth_errors import depth_table
+from bench.evaluate import START, STARTS, evaluate_pair, run_garps
 from bench.intervals import Difference, paired_difference
+from bench.jobs import computed
 from bench.learned_rooms import SPLITS, few_matches, load, with_learned_depth
-from bench.rgbd import GARPS_NO_FEATURES, TABLE_WIDTH, VARIANTS, evaluate_pair, run_garps
+from bench.rgbd import TABLE_WIDTH
 from bench.runs import RowLog, key_of
 from bench.tables import GARPS, Row, machine_facts, print_tables, write
+from bench.variants import GARPS_NO_FEATURES, VARIANTS
 from garps_core import Config
 from garps_core.errors import GarpsError
 from garps_core.models import demo_net
@@ -41,7 +42,7 @@ from garps_core.models.loaded import depth_network_of
 from garps_core.settings import changed_config
 
 DEPTH = "demo_net"
-STARTS = ("features", "disturbed", "none")
+DEFAULT_STARTS = ("features", "disturbed", "none")
 SLOWEST = "kiss-matcher+gicp"
 
 
@@ -75,8 +76,7 @@ def bars(rows: Sequence[Row]) -> Iterator[Bar]:
 
 
 def evaluated(pair: Pair, config: Config, starts: Sequence[str], methods: Sequence[str], seed: int) -> list[list[Row]]:
-    """Rows of one pair with the network's depth, per start; in a process with one thread, so that times compare."""
-    torch.set_num_threads(1)
+    """Rows of one pair with the network's depth, per start."""
     learned = with_learned_depth(pair, _network(config))
     given = config.replace({"reconstruction.method": "rgbd"})
     found = []
@@ -94,7 +94,7 @@ def _network(config: Config) -> demo_net.DemoNet:
 
 def main(
     split: Annotated[str, typer.Option(help=f"one of {', '.join(SPLITS)}")] = "report",
-    starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}")] = ",".join(STARTS),
+    starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}")] = ",".join(DEFAULT_STARTS),
     methods: Annotated[str, typer.Option(help=f"comma-separated from {', '.join((*VARIANTS, *METHODS))}")] = "",
     change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
     workers: Annotated[int, typer.Option(min=1, help="processes")] = 2,
@@ -145,12 +145,12 @@ def _run(
     if not missing:
         return
     run_garps(config, missing[0], "disturbed", disturbed_prior(missing[0]))  # compiles, once for all processes
-    with ProcessPoolExecutor(workers) as pool, Progress(console=console) as bar:
-        work = partial(evaluated, config=config, starts=starts, methods=methods, seed=seed)
-        for of_starts in bar.track(pool.map(work, missing), total=len(missing), description="pairs"):
-            for rows in of_starts:
-                if key_of(rows[0]) not in log.done:
-                    log.add(rows)
+    work = partial(evaluated, config=config, starts=starts, methods=methods, seed=seed)
+    with Progress(console=console) as bar:
+        found = computed(work, missing, workers)
+        for rows in (rows for of_starts in bar.track(found, len(missing), description="pairs") for rows in of_starts):
+            if key_of(rows[0]) not in log.done:
+                log.add(rows)
 
 
 if __name__ == "__main__":

@@ -80,6 +80,7 @@ def stored(seed: int, folder: Path) -> Path:
             file,
             rgb=np.stack(rgbs),
             depth=np.stack([made.true_depth0, made.true_depth1]),
+            labels=np.stack([made.labels0, made.labels1]).astype(np.uint8),
             K=np.stack([made.K0, made.K1]),
             T=made.T_1_0,
         )
@@ -90,9 +91,9 @@ def stored(seed: int, folder: Path) -> Path:
 def _read(seed: int, path: Path) -> Pair:
     with np.load(path, allow_pickle=False) as file:
         views = [View(*given) for given in zip(file["rgb"], file["K"], file["depth"], strict=True)]
-        T = file["T"]
+        T, labels = file["T"], file["labels"].astype(np.int32)
     name = f"room{seed}_level{level_of(seed)}"
-    return Pair(SET, name, kind_of(seed), views[0], views[1], T, scene_points(views[0]))
+    return Pair(SET, name, kind_of(seed), views[0], views[1], T, scene_points(views[0]), labels=(labels[0], labels[1]))
 
 
 def with_learned_depth(pair: Pair, network: DemoNet) -> Pair:

@@ -13,156 +13,28 @@ Rows (one per pair, start and method) go to rows.jsonl as they come, and to rows
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import track
 
 from bench import acceptance, bare
-from bench.acceptance import START
 from bench.baselines import METHODS
-from bench.datasets import DATA, HALVES, Pair, disturbed_prior, truth_covariance
+from bench.datasets import DATA, HALVES, Pair, disturbed_prior
+from bench.evaluate import evaluate_pair, run_garps
 from bench.plan import STARTS, Part, pairs_of, parts
 from bench.runs import Key, RowLog, reusable_rows
 from bench.tables import GARPS, Row, machine_facts, print_tables, write
-from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
-from garps_core.checks import Float64Array
-from garps_core.initialise import identity
+from bench.variants import GARPS_NO_FEATURES, VARIANTS
+from garps_core import Config, GarpsError
 from garps_core.settings import changed_config
 
-GARPS_NO_FEATURES = "garps-no-features"
-"""GARPS with `start.features` off: run only where the setting exists, and where the start is not its own features."""
-VARIANTS = (GARPS, GARPS_NO_FEATURES)
 TABLE_WIDTH = 200
 """Columns of a table that goes to a file or a pipe."""
 PEERS = ("open3d-gicp", "open3d-colored", "small-gicp", "sift-pnp")
-
-
-def evaluate(
-    config: Config,
-    pairs: Sequence[Pair],
-    start: str = "disturbed",
-    methods: Iterable[str] = (GARPS,),
-    seed: int = 0,
-    progress: Callable[[Sequence[Pair]], Iterable[Pair]] = iter,
-) -> list[Row]:
-    """Run GARPS and peers on pairs from one kind of start.
-
-    Args:
-        config: settings of GARPS; its `start.method` is set here.
-        pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
-        start: "features" (GARPS' own features + PnP), "disturbed" (truth off by 1 deg and 0.12 m, given as a prior),
-            "identity", or "none" (GARPS starts as it sees fit, peers that need a start from identity).
-        methods: "garps", "garps-no-features" and names from `bench.baselines.METHODS`. GARPS always runs where the
-            start comes from it.
-        seed: of the disturbance.
-        progress: wraps the pairs, for a progress bar.
-    Returns: rows, per pair first "(start)", then the methods in order.
-    """
-    chosen = list(methods)
-    return [row for pair in progress(pairs) for row in evaluate_pair(config, pair, start, chosen, seed)]
-
-
-def evaluate_pair(
-    config: Config,
-    pair: Pair,
-    start: str,
-    methods: Sequence[str],
-    seed: int = 0,
-    known: Mapping[str, Row] | None = None,
-) -> list[Row]:
-    """`evaluate` on one pair; peers in `known` are not run, their rows are taken from there."""
-    prior = {
-        "disturbed": lambda: disturbed_prior(pair, seed),
-        "identity": lambda: identity(config, "a guess"),
-    }.get(start, lambda: None)()
-    initial, estimate, seconds = prior, None, float("nan")
-    if GARPS in methods or prior is None:
-        estimate, seconds = run_garps(config, pair, start, prior)
-        initial = estimate.initial if prior is None else prior
-    rows = [_start_row(pair, start, initial, estimate if prior is None else None)]
-    T_start = None if initial is None else initial.T_target_source
-    for name in methods:
-        if name == GARPS and estimate is not None:
-            rows.append(_garps_row(pair, start, GARPS, estimate, seconds))
-        elif name == GARPS_NO_FEATURES:
-            if prior is not None:
-                without = run_garps(config.replace({"start.features": False}), pair, start, prior)
-                rows.append(_garps_row(pair, start, name, *without))
-        elif known and name in known:
-            rows.append(known[name])
-        else:
-            began = time.perf_counter()
-            T, reason = METHODS[name](pair.source, pair.target, np.eye(4) if start == "none" else T_start)
-            rows.append(_row(pair, start, name, T, time.perf_counter() - began, reason))
-    return rows
-
-
-def _start_row(pair: Pair, start: str, initial: Prior | None, own: PoseEstimate | None) -> Row:
-    """The pose before the alignment; `own` = GARPS' estimate where it chose the pose itself."""
-    seconds = float("nan") if own is None else own.seconds.get("initialise", float("nan"))
-    if initial is None:
-        return _row(pair, start, START, None, seconds, "" if own is None else own.reason)
-    return _row(pair, start, START, initial.T_target_source, seconds, "", initial.covariance)
-
-
-def _garps_row(pair: Pair, start: str, name: str, estimate: PoseEstimate, seconds: float) -> Row:
-    row = _row(pair, start, name, estimate.T_target_source, seconds, estimate.reason, estimate.covariance)
-    return row | {
-        "status": estimate.status.value,
-        "origin": "" if estimate.initial is None else estimate.initial.origin,
-        "overlap": estimate.overlap,
-        "quality": estimate.quality,
-        "iterations": estimate.iterations,
-        "objective": estimate.objective,
-        **{f"seconds_{stage}": value for stage, value in estimate.seconds.items()},
-    }
-
-
-def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tuple[PoseEstimate, float]:
-    """GARPS from one kind of start: the estimate and its wall time in s."""
-    config = config.replace({"start.method": "features" if start == "features" else "auto"})
-    began = time.perf_counter()
-    try:
-        estimate = estimate_relative_pose(pair.source, pair.target, config, prior)
-    except GarpsError as error:  # an answer about this pair, not about the others
-        estimate = PoseEstimate(Status.NO_INITIAL_POSE, f"{type(error).__name__}: {error}", initial=prior)
-    return estimate, time.perf_counter() - began
-
-
-def _row(
-    pair: Pair,
-    start: str,
-    method: str,
-    T: Float64Array | None,
-    seconds: float,
-    reason: str,
-    covariance: Float64Array | None = None,
-) -> Row:
-    row: Row = {"set": pair.set, "pair": pair.id, "category": pair.category, "start": start, "method": method}
-    row |= {"found": T is not None, "seconds": seconds, "reason": reason}
-    if T is None:
-        return row | dict.fromkeys(("e_trans_m", "e_rot_deg", "e_3d_m"), float("inf"))
-    truth = pair.T_target_source
-    row |= {
-        "e_trans_m": metrics.translation_error_m(T, truth),
-        "e_rot_deg": metrics.rotation_error_deg(T, truth),
-        "e_3d_m": metrics.error_3d_m(T, truth, pair.points),
-        "e_dir_deg": metrics.direction_error_deg(T, truth),
-        "scale_ratio": metrics.scale_ratio(T, truth),
-        "T": T[:3].ravel().tolist(),
-    }
-    if covariance is not None:
-        row |= {
-            "nees": metrics.nees(T, covariance + truth_covariance(pair), truth),
-            "covariance": np.asarray(covariance).ravel().tolist(),
-        }
-    return row
 
 
 def main(
@@ -190,7 +62,7 @@ def main(
     console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
     try:
         planned = parts(full, monocular, _split(sets), _split(starts), half, data)
-        chosen = _split(methods) or ([*VARIANTS, *METHODS] if full else [GARPS, *PEERS])
+        chosen = _split(methods) or ([GARPS, GARPS_NO_FEATURES, *METHODS] if full else [GARPS, *PEERS])
         _check_methods(chosen)
         if full and preset:
             raise ValueError("--full takes the preset of each depth: leave out --preset")

@@ -29,8 +29,8 @@ from rich.table import Table
 
 from bench import bare
 from bench.datasets import DATA
+from bench.evaluate import evaluate
 from bench.plan import MONOCULAR, SENSOR, Part, pairs_of, parts
-from bench.rgbd import evaluate
 from bench.tables import GARPS, Row
 from garps_core import Config
 

@@ -96,13 +96,19 @@ def _estimated(
         spent["initialise"] = time.perf_counter() - begin
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)
     spent["initialise"], begin = time.perf_counter() - begin, time.perf_counter()
-    estimate = _best_of(x, y, starts, config)
+    estimate = best_of(x, y, starts, config)
     estimate.seconds.update(spent, align=time.perf_counter() - begin)
     return estimate, (x, y)
 
 
-def _best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
-    """The best estimate of several starts; where features led nowhere, also a search from identity is tried."""
+def best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
+    """The best estimate of several initial poses; where features led nowhere, also a search from identity is tried.
+
+    Args:
+        x, y: source and target, as `reconstruct` makes them.
+        starts: at least one, as `initialise` gives them.
+        config: as for `align_mixtures`.
+    """
     estimates = [align_mixtures(x, y, start, config) for start in starts]
     best = max(estimates, key=_merit)
     may_search = config.start.method == "auto" and config.start.identity_fallback

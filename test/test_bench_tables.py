@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from bench import acceptance, plan, rgbd, runs, tables
+from bench import acceptance, evaluate, plan, runs, tables
 from bench.baselines import METHODS
 
 INF = float("inf")
@@ -185,9 +185,9 @@ def test_known_rows_of_peers_are_taken_over():
     pair = bare.room_pair(22, 1, WIDTH, HEIGHT)
     known = {"open3d-gicp": made_row("open3d-gicp", reused="abc")}
     methods = ["garps", "garps-no-features", "open3d-gicp"]
-    rows = rgbd.evaluate_pair(Config.preset("monocular"), pair, "none", methods, known=known)
+    rows = evaluate.evaluate_pair(Config.preset("monocular"), pair, "none", methods, known=known)
     assert [row["method"] for row in rows] == ["(start)", "garps", "open3d-gicp"]
     assert rows[2] is known["open3d-gicp"]
     assert rows[1]["status"] and "quality" in rows[1]
-    disturbed = rgbd.evaluate_pair(Config.preset("monocular"), pair, "disturbed", methods[:2])
+    disturbed = evaluate.evaluate_pair(Config.preset("monocular"), pair, "disturbed", methods[:2])
     assert [row["method"] for row in disturbed] == ["(start)", *methods[:2]]

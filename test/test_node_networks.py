@@ -51,6 +51,18 @@ def test_two_plain_images_give_the_offline_pose(networked, tmp_path, monkeypatch
     assert_equal(odometry, estimate)
 
 
+def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
+    with running(domain, tmp_path, ["preset=demo_net"]) as (node, peer):
+        peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
+        before = node.log().split("ready")[0]
+        assert "loaded demo_net (a demonstration: " in before and "demo_net is a demonstration: " in before
+        shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
+        assert values(peer, "machine")["scale from"].startswith("demo_net (a demonstration: ")
+    estimate = offline(shots, [], preset="demo_net")
+    assert_equal(pose, estimate)
+    assert_equal(odometry, estimate)
+
+
 def test_weights_that_are_missing_end_the_start(domain, tmp_path):
     empty = with_weights(domain, tmp_path)
     node = NodeProcess(words(*NETWORK), empty.environment, tmp_path / "node.log")
