@@ -45,6 +45,7 @@ setup(
         "poselib",
         "rich",
         "rosbags>=0.10",
+        "ruamel.yaml>=0.17",
         "safetensors>=0.4",
         "scipy>=1.11",
         "torch>=2.1",

@@ -89,7 +89,11 @@ def load_pairs(name: str, data: Path = DATA, limit: int | None = None, half: str
         FileNotFoundError: the set is not there.
         ValueError: no such half.
     """
-    folder = data / "dev" / name
+    return read_pairs(name, data / "dev" / name, limit, half)
+
+
+def read_pairs(name: str, folder: Path, limit: int | None = None, half: str = "all") -> list[Pair]:
+    """The pairs of a folder with a `pairs.json`. Raises as `load_pairs`."""
     records = json.loads((folder / "pairs.json").read_text())["pairs"]
     chosen = ids_of_half([record["id"] for record in records], half)
     records = spread([record for record in records if record["id"] in chosen], limit)

@@ -10,7 +10,6 @@ Seeds are not those of the rooms to learn from (`bench.depth_data`). Levels (`be
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +21,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bench.bare import in_the_dark, matches
-from bench.datasets import Pair, scene_points
+from bench.datasets import Pair, scene_points, spread
+from bench.jobs import computed
 from bench.rooms import LEVELS, make_pair
 from garps_core import View
 from garps_core.models.demo_net import DemoNet, depth_of
@@ -45,8 +45,8 @@ def level_of(seed: int) -> int:
     return sorted(LEVELS)[seed % len(LEVELS)]
 
 
-def load(split: str, folder: Path, console: Console, workers: int = 2) -> list[Pair]:
-    """Pairs of a split with true depth, `category` = kind; made where they are not yet in the folder.
+def load(split: str, folder: Path, console: Console, workers: int = 2, limit: int | None = None) -> list[Pair]:
+    """Pairs of a split, at most `limit`, with true depth, `category` = kind; made where they are not yet there.
 
     Raises:
         ValueError: no such split.
@@ -54,14 +54,12 @@ def load(split: str, folder: Path, console: Console, workers: int = 2) -> list[P
     if split not in SPLITS:
         raise ValueError(f"split is {split!r}: expected one of {', '.join(SPLITS)}")
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = SPLITS[split]
-    with ProcessPoolExecutor(workers) as pool, Progress(console=console) as bars:
-        paths = pool.map(partial(stored, folder=folder), seeds)
+    seeds = spread(list(SPLITS[split]), limit)
+    with Progress(console=console) as bars:
+        paths = computed(partial(stored, folder=folder), seeds, workers)
         return [
             _read(seed, path)
-            for seed, path in bars.track(
-                zip(seeds, paths, strict=True), total=len(seeds), description=f"{SET}, {split}"
-            )
+            for seed, path in zip(seeds, bars.track(paths, len(seeds), description=f"{SET}, {split}"), strict=True)
         ]
 
 

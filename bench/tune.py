@@ -4,6 +4,9 @@
     python -m bench.tune --depth sensor --trials 40      # searches; goes on with the study that is in --out
     python -m bench.tune --depth sensor --trials 0       # only reports: default against best, on both halves
 
+The best settings are written to --out as DEPTH.yaml: for `garps align --settings`, `garps-replay --settings`,
+`python -m bench.run --settings` and, as a file of parameters, for the node.
+
 Settings are chosen on `--half dev` of the recorded pairs and, for monocular depth, on the bare rooms to tune on; the
 held-out half and the other rooms are looked at once, by the report. A trial is worth the mean over all tables of
 
@@ -33,6 +36,7 @@ from bench.evaluate import evaluate
 from bench.plan import MONOCULAR, SENSOR, Part, pairs_of, parts
 from bench.tables import GARPS, Row
 from garps_core import Config
+from garps_core.settings import write_settings
 
 SPACES: dict[str, dict[str, tuple[float, float]]] = {
     SENSOR: {
@@ -157,6 +161,10 @@ def main(
     console.print(f"{len(study.trials)} trials, best {study.best_value:.3f}:")
     for name, value in study.best_params.items():
         console.print(f"  {name} = {value:.4g}   (preset: {Config.preset(depth).settings()[name]:g})")
+    chosen = out / f"{depth}.yaml"
+    remark = f"Best of {len(study.trials)} trials of python -m bench.tune --depth {depth}: loss {study.best_value:.4f}"
+    write_settings(chosen, depth, study.best_params, remark)
+    console.print(f"settings: {chosen}")
     console.print(report(study, depth, (data, bare_rooms), console))
 
 

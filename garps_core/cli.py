@@ -24,7 +24,7 @@ from garps_core.initialise import identity
 from garps_core.pairing import checked_device
 from garps_core.reconstruct import check_settings
 from garps_core.report import as_json, as_text
-from garps_core.settings import changed_config
+from garps_core.settings import changed_config, read_settings
 from garps_core.splat_reader import read_splats
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.weights_cli import app as weights_app
@@ -103,6 +103,9 @@ def align(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
+    settings: Annotated[
+        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+    ] = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print everything as JSON, full precision.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Write a before/after picture (needs matplotlib).")] = None,
@@ -126,8 +129,10 @@ def align(
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    method = _configured("default", set_ or [], options).reconstruction.method
-    config = _configured(preset or preset_for(method, splats or any(depths)), set_ or [], options)
+    changes = set_ or []
+    method = _configured(Config(), settings, changes, options).reconstruction.method
+    base = Config.preset(preset or preset_for(method, splats or any(depths)))
+    config = _configured(base, settings, changes, options)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -225,9 +230,9 @@ def _uncalibrated(
     return source, target
 
 
-def _configured(preset: str, changes: list[str], options: dict[str, str | None]) -> Config:
+def _configured(base: Config, file: Path | None, changes: list[str], options: dict[str, str | None]) -> Config:
     given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(Config.preset(preset), changes).replace(given)
+    config = changed_config(base if file is None else read_settings(file, base), changes).replace(given)
     checked_device(config.device)
     return config
 

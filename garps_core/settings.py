@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as text, NAME=VALUE, to the type each setting has."""
+"""Settings as text, NAME=VALUE, to the type each setting has; and as a YAML file, that of the node's parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from garps_core.config import Config
 from garps_core.errors import ConfigError
+
+MAX_BYTES = 2**20
+"""Of a settings file."""
+OF_A_NODE = "ros__parameters"
 
 
 def changed_config(config: Config, changes: Iterable[str]) -> Config:
@@ -35,3 +43,60 @@ def _value(name: str, text: str, current: Any) -> Any:
             kind = "an integer" if isinstance(current, int) else "a number"
             raise ConfigError(f"{name} is {text!r}: expected {kind}") from None
     return text
+
+
+def read_settings(path: Path, config: Config | None = None) -> Config:
+    """The settings of a YAML file: `preset`, if it names one, and single settings above it.
+
+    Args:
+        path: a mapping `lifting.stride: 4`, nested by the parts if need be; or the same as parameters of a node,
+            below `/**: ros__parameters:`.
+        config: what the settings change where the file names no preset; the default preset when None.
+    Raises:
+        ConfigError: not such a file, a name that is no setting, or a value out of range.
+    """
+    given = dict(_flat("", _mapping(path)))
+    preset = given.pop("preset", None)
+    try:
+        base = Config.preset(str(preset)) if preset is not None else config or Config()
+        return base.replace(given)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def write_settings(path: Path, preset: str, changes: Mapping[str, Any], remark: str = "") -> None:
+    """Write what `read_settings` reads, as a parameter file for the node; `remark`: lines of a comment."""
+    lines = ["# " + line for line in remark.splitlines()]
+    lines += ["/**:", f"  {OF_A_NODE}:", f"    preset: {preset}"]
+    lines += [f"    {name}: {_yaml(value)}" for name, value in changes.items()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float) and "." not in repr(value):  # YAML takes 1e-05 for a text
+        return repr(value).replace("e", ".0e")
+    return repr(value) if isinstance(value, (int, float)) else f'"{value}"'
+
+
+def _mapping(path: Path) -> Mapping[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(f"{path} has {path.stat().st_size} bytes: expected settings, at most {MAX_BYTES}")
+        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise ConfigError(f"cannot read settings from {path}: {reason}") from None
+    if isinstance(content, dict) and len(content) == 1:
+        (only,) = content.values()
+        if isinstance(only, dict) and set(only) == {OF_A_NODE}:
+            content = only[OF_A_NODE]
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} holds {type(content).__name__}: expected lines like `lifting.stride: 4`")
+    return content
+
+
+def _flat(prefix: str, part: Mapping[Any, Any]) -> Iterable[tuple[str, Any]]:
+    for name, value in part.items():
+        yield from _flat(f"{prefix}{name}.", value) if isinstance(value, dict) else [(f"{prefix}{name}", value)]

@@ -20,7 +20,7 @@ from rich.progress import Progress
 from garps_core.align import estimate_relative_pose
 from garps_core.config import METHODS, PRESETS, Config, preset_for
 from garps_core.errors import GarpsError
-from garps_core.settings import changed_config
+from garps_core.settings import changed_config, read_settings
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
 from garps_ros.cameras import CameraTopics
@@ -153,6 +153,9 @@ def replay(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
     ] = None,
+    settings: Annotated[
+        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+    ] = None,
     to_ros: ToRos = False,
     rate: Rate = 1.0,
     loop: Loop = False,
@@ -165,7 +168,7 @@ def replay(
         return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
     _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
-    config = _configured(preset, reconstruction, set_ or [])
+    config = _configured(preset, reconstruction, settings, set_ or [])
     rule = KeyframeRule(
         keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after, depth_share(config)
     )
@@ -178,11 +181,15 @@ def replay(
             return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
 
 
-def _configured(preset: str | None, method: str | None, changes: list[str]) -> Config:
+def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
     """The settings; of a network from the preset for its depth, where none is given."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
-    with_sensor = needs_depth(changed_config(Config(), changes))
-    config = changed_config(Config.preset(preset or preset_for(method or "", with_sensor)), changes)
+
+    def changed(base: Config) -> Config:
+        return changed_config(base if file is None else read_settings(file, base), changes)
+
+    asked = changed(Config())
+    config = changed(Config.preset(preset or preset_for(asked.reconstruction.method, needs_depth(asked))))
     check_method(config)
     return config
 

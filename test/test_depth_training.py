@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from bench.depth_data import shots
-from bench.rooms.shading import camera_rays
 from bench.depth_pictures import batches
+from bench.rooms.shading import camera_rays
 from bench.train_depth import Training, folded, loss_of, rate_at
 from garps_core import View
 from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, depth_of
