@@ -37,6 +37,8 @@ TRUTH_REACH = {
 """How far each set's own truth can be trusted, m and deg (the sets' README); generated pairs are exact."""
 DISTURBANCE_M = 0.12
 DISTURBANCE_DEG = 1.0
+NOMINAL_RANGE_M = 3.0
+"""Where the centre of a scene is taken to lie on the optical axis when nothing is known of its points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +174,9 @@ def disturbed_prior(pair: Pair, seed: int = 0) -> Prior:
 
     A turn w about the scene centre c and a move v shift the source origin t (target frame) by v + w x (t - c).
     """
-    start = disturbed(pair.T_target_source, pair.points, rng_of(pair.id, seed))
-    lever = start[:3, 3] - transform(start, pair.points).mean(0)
+    points = pair.points if len(pair.points) else np.array([[0.0, 0.0, NOMINAL_RANGE_M]])
+    start = disturbed(pair.T_target_source, points, rng_of(pair.id, seed))
+    lever = start[:3, 3] - transform(start, points).mean(0)
     J = np.eye(6)
     J[:3, 3:] = -skew(lever)
     variances = np.repeat([DISTURBANCE_M**2 / 3, np.radians(DISTURBANCE_DEG) ** 2 / 3], 3)

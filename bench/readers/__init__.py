@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readers of public data sets: a name and a folder become pairs with true pose.
+
+Each module says which files it expects where. Nothing is downloaded, nothing is guessed: what is missing is listed.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.datasets import Pair
+from bench.readers import mapfree, pair_list, realestate10k, scannet1500, seven_scenes, tum
+from bench.readers.files import MissingFiles
+
+__all__ = ["READERS", "MissingFiles", "load"]
+
+READERS: Mapping[str, Callable[..., list[Pair]]] = {
+    "mapfree": mapfree.read,
+    "pair-list": pair_list.read,
+    "realestate10k": realestate10k.read,
+    "realestate10k-validation": functools.partial(realestate10k.read, split="validation"),
+    "scannet1500": scannet1500.read,
+    "seven_scenes": seven_scenes.read,
+    "tum": tum.read,
+}
+"""Every reader takes a folder and, by name, `limit`, `skipped` and options of its own."""
+
+
+def load(
+    name: str, folder: Path, limit: int | None = None, skipped: list[str] | None = None, **options: Any
+) -> list[Pair]:
+    """The pairs of a data set.
+
+    Args:
+        name: of `READERS`.
+        folder: where it lies, in the layout that the reader's module describes.
+        limit: at most so many pairs, spread evenly; None = all.
+        skipped: None = every file must be there; a list = pairs with missing files are left out and named in it.
+        options: of the reader.
+    Raises:
+        MissingFiles: names the first few and how many, and the layout.
+        ValueError: no such reader or folder, or a file that is not what it should be, with file and line.
+    """
+    if name not in READERS:
+        raise ValueError(f"no reader {name!r}: expected one of {', '.join(READERS)}")
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder: expected one with the data set {name}")
+    return READERS[name](folder, limit=limit, skipped=skipped, **options)
