@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from bench.pnp import Failure
+from bench.registration import open3d
 from garps_core.checks import Float64Array
 from garps_core.types import View
 
@@ -24,6 +25,16 @@ ITERATIONS = [40, 30, 30]
 DEPTH_DIFFERENCE_M = {"hybrid": 0.15, "intensity": 0.3}
 """Pixels whose depths differ by more are left out. Colour alone needs more of them; the other does as well at 0.07."""
 NEAR_M, FAR_M = 0.1, 20.0
+
+
+def rgbd_hybrid(source: View, target: View, T_start: Float64Array) -> Float64Array:
+    """RGB-D odometry of Open3D, colour and depth."""
+    return rgbd_odometry(source, target, T_start, "hybrid")
+
+
+def rgbd_intensity(source: View, target: View, T_start: Float64Array) -> Float64Array:
+    """RGB-D odometry of Open3D, colour alone."""
+    return rgbd_odometry(source, target, T_start, "intensity")
 
 
 def rgbd_odometry(source: View, target: View, T_start: Float64Array, kind: str) -> Float64Array:
@@ -38,8 +49,7 @@ def rgbd_odometry(source: View, target: View, T_start: Float64Array, kind: str) 
     Raises:
         Failure: no depth, or the library says that it failed.
     """
-    import open3d as o3d
-
+    o3d = open3d()
     odometry = o3d.pipelines.odometry
     terms = {
         "hybrid": odometry.RGBDOdometryJacobianFromHybridTerm,

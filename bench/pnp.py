@@ -28,12 +28,12 @@ class Failure(Exception):
 
 
 def features_pnp(source: View, target: View) -> Float64Array:
-    """RootSIFT, then PoseLib's absolute pose each way (depth of one, pixels of the other), then both refined together.
+    """RootSIFT, PoseLib's absolute pose each way (depth of one, pixels of the other), then both refined together.
 
     Raises:
         Failure: too few matches or inliers.
     """
-    pixels_source, pixels_target = _matches(source.rgb, target.rgb)
+    pixels_source, pixels_target = matches(source.rgb, target.rgb)
     forward = _Projections(*_with_depth(source, pixels_source, pixels_target), target.K, inverse=False)
     backward = _Projections(*_with_depth(target, pixels_target, pixels_source), source.K, inverse=True)
     found = [pose for way in (forward, backward) if (pose := way.ransac()) is not None]
@@ -43,7 +43,21 @@ def features_pnp(source: View, target: View) -> Float64Array:
     return _refined(best, [way.subset(way.inliers(best)) for way in (forward, backward)])
 
 
-def _matches(rgb_source: Any, rgb_target: Any) -> tuple[Float64Array, Float64Array]:
+def features_pnp_oneway(source: View, target: View) -> Float64Array:
+    """RootSIFT and PoseLib's absolute pose: depth of the source, pixels of the target.
+
+    Raises:
+        Failure: too few matches or inliers.
+    """
+    pixels_source, pixels_target = matches(source.rgb, target.rgb)
+    points = _with_depth(source, pixels_source, pixels_target)
+    pose = _Projections(*points, target.K, inverse=False).ransac()
+    if pose is None:
+        raise Failure(f"no pose with {MIN_INLIERS} inliers ({len(pixels_source)} matches)")
+    return pose
+
+
+def matches(rgb_source: Any, rgb_target: Any) -> tuple[Float64Array, Float64Array]:
     """Mutual RootSIFT matches that pass the ratio test: pixels Nx2 in each image."""
     found = [_root_sift(rgb) for rgb in (rgb_source, rgb_target)]
     if min(len(pixels) for pixels, _ in found) < 2:
@@ -70,20 +84,31 @@ def _root_sift(rgb: Any) -> tuple[Float64Array, Any]:
 
 def _with_depth(view: View, own: Float64Array, other: Float64Array) -> tuple[Float64Array, Float64Array]:
     """Points (Mx3, m, frame of `view`) of its keypoints that have trusted depth, and the other image's pixels (Mx2)."""
+    z = trusted_depth(view, own)
+    good = np.isfinite(z)
+    return (pixel_rays(view.K, own[:, 0], own[:, 1]) * z[:, None])[good], other[good]
+
+
+def trusted_depth(view: View, pixels: Float64Array) -> Float64Array:
+    """Depth (N, m) at pixels Nx2, NaN where there is none or its surroundings vary by more than `MAX_RELIEF`."""
     if view.depth is None:
-        return np.zeros((0, 3)), np.zeros((0, 2))
+        return np.full(len(pixels), np.nan)
     height, width = view.depth.shape
-    u, v = np.rint(own).astype(int).T
+    u, v = np.rint(pixels).astype(int).T
     offsets = np.arange(-2, 3)
     patch_v = np.clip(v[:, None, None] + offsets[:, None], 0, height - 1)
     patch_u = np.clip(u[:, None, None] + offsets, 0, width - 1)
-    patches = view.depth[patch_v, patch_u].astype(np.float64).reshape(len(own), -1)
+    patches = view.depth[patch_v, patch_u].astype(np.float64).reshape(len(pixels), 25)
     z = patches[:, 12]
     with np.errstate(invalid="ignore"):
         high = np.where(np.isfinite(patches), patches, -np.inf).max(1, initial=-np.inf)
         low = np.where(np.isfinite(patches), patches, np.inf).min(1, initial=np.inf)
-        good = np.isfinite(z) & (high - low < MAX_RELIEF * z)
-    return (pixel_rays(view.K, own[:, 0], own[:, 1]) * z[:, None])[good], other[good]
+        return np.where(np.isfinite(z) & (high - low < MAX_RELIEF * z), z, np.nan)
+
+
+def camera(K: Float64Array) -> dict[str, Any]:
+    """A pinhole camera as PoseLib takes it."""
+    return {"model": "PINHOLE", "width": 0, "height": 0, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
 
 
 class _Projections:
@@ -110,11 +135,8 @@ class _Projections:
 
         if len(self.points) < MIN_INLIERS:
             return None
-        K = self.K
-        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-        camera = {"model": "PINHOLE", "width": 0, "height": 0, "params": params}
         options = {"max_reproj_error": RANSAC_PX, "max_error": RANSAC_PX}
-        pose, info = poselib.estimate_absolute_pose(self.pixels, self.points, camera, options, {})
+        pose, info = poselib.estimate_absolute_pose(self.pixels, self.points, camera(self.K), options, {})
         if info["num_inliers"] < MIN_INLIERS:
             return None
         T = np.eye(4)

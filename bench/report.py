@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run of `bench.run` leaves behind: rows, tables, plots, and pictures of pairs before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from bench.datasets import Pair
+from bench.evaluate import START
+from bench.paper_tables import paper_report
+from bench.plots import write_plots
+from bench.sources import config_of, with_depth_of
+from bench.tables import GARPS, Row, print_tables, write
+from garps_core import reconstruct
+from garps_core.figure import before_after
+
+MAX_PICTURES = 8
+
+
+def write_report(
+    out: Path, rows: Sequence[Row], facts: Row, pairs: Sequence[Pair], left_out: Sequence[str], console: Console
+) -> None:
+    """Everything into a folder, the tables also to the console.
+
+    Args:
+        out: the folder.
+        rows: of all jobs.
+        facts: machine, versions, commit, seeds, settings.
+        pairs: those the rows are of, with their own depth.
+        left_out: what could not be run, in words.
+        console: where the tables are printed.
+    """
+    print_tables(console, rows, facts)
+    text = paper_report(rows)
+    if left_out:
+        text += "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n"
+    console.print(text, markup=False, soft_wrap=True)
+    write(out, rows, facts, "\n" + text)
+    write_plots(rows, out / "plots")
+    for path in write_pictures(rows, pairs, out / "pictures", int(facts.get("seed", 0))):
+        console.print(f"picture: {path}", soft_wrap=True)
+    console.print(f"rows, tables, plots and pictures: {out}", soft_wrap=True)
+
+
+def write_pictures(rows: Sequence[Row], pairs: Sequence[Pair], out: Path, seed: int) -> Iterator[Path]:
+    """The pair of median error of every table, at the start and as GARPS leaves it; at most `MAX_PICTURES`."""
+    of_pair = {(pair.set, pair.id): pair for pair in pairs}
+    starts = {_place(row): row for row in rows if row["method"] == START and row["found"]}
+    own = [row for row in rows if row["method"] == GARPS and row["found"] and _place(row) in starts]
+    tables = list(dict.fromkeys(_place(row)[:3] for row in own))
+    for table in tables[:MAX_PICTURES]:
+        chosen = sorted((row for row in own if _place(row)[:3] == table), key=lambda row: float(row["e_3d_m"]))
+        row = chosen[len(chosen) // 2]
+        if (pair := of_pair.get((row["set"], row["pair"]))) is None:
+            continue
+        out.mkdir(parents=True, exist_ok=True)
+        seen = with_depth_of(pair, row["depth"], seed)
+        mixtures = [reconstruct(view, config_of(row["depth"])) for view in (seen.source, seen.target)]
+        start = starts[_place(row)]
+        title = (
+            f"{row['set']}, {row['pair']}, depth {row['depth']}, start {row['start']}: E_3D {start['e_3d_m']:.4f} m "
+            f"before, {row['e_3d_m']:.4f} m after"
+        )
+        yield before_after(*mixtures, _pose(start), _pose(row), out / f"{'_'.join(table)}.png", title)
+
+
+def _place(row: Row) -> tuple[str, str, str, str]:
+    return row["depth"], row["set"], row["start"], row["pair"]
+
+
+def _pose(row: Row) -> np.ndarray:
+    return np.vstack([np.reshape(row["T"], (3, 4)), [0, 0, 0, 1]])
