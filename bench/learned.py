@@ -11,7 +11,7 @@ Every method gets the same depth maps. Into --out go the rows as they come, rows
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -42,8 +42,13 @@ from garps_core.models.loaded import depth_network_of
 from garps_core.settings import changed_config
 
 DEPTH = "demo_net"
-DEFAULT_STARTS = ("features", "disturbed", "none")
-SLOWEST = "kiss-matcher+gicp"
+REGISTRATION = ["open3d-gicp", "open3d-colored", "small-gicp"]
+METHODS_OF = {
+    "features": [GARPS, "small-gicp", "sift-pnp"],
+    "disturbed": [GARPS, GARPS_NO_FEATURES, *REGISTRATION, "rgbd-intensity", "sift-pnp"],
+    "none": [GARPS, *REGISTRATION, "sift-pnp", "sift-pnp+small-gicp", "kiss-matcher+gicp"],
+}
+"""What is run from each start by default."""
 
 
 def differences(rows: Sequence[Row], start: str, method: str = GARPS, other: str = START) -> dict[str, Difference]:
@@ -75,15 +80,14 @@ def bars(rows: Sequence[Row]) -> Iterator[Bar]:
             yield Bar(f"{start}: {name} E_3D {words} than the start's", f"{found} m, 95 %", getattr(found, asked))
 
 
-def evaluated(pair: Pair, config: Config, starts: Sequence[str], methods: Sequence[str], seed: int) -> list[list[Row]]:
+def evaluated(pair: Pair, config: Config, methods: Mapping[str, Sequence[str]], seed: int) -> list[list[Row]]:
     """Rows of one pair with the network's depth, per start."""
     learned = with_learned_depth(pair, _network(config))
     given = config.replace({"reconstruction.method": "rgbd"})
-    found = []
-    for start in starts:
-        of_start = [name for name in methods if not (start != "none" and name == SLOWEST)]
-        found.append([{"depth": DEPTH} | row for row in evaluate_pair(given, learned, start, of_start, seed)])
-    return found
+    return [
+        [{"depth": DEPTH} | row for row in evaluate_pair(given, learned, start, of_start, seed)]
+        for start, of_start in methods.items()
+    ]
 
 
 def _network(config: Config) -> demo_net.DemoNet:
@@ -94,8 +98,10 @@ def _network(config: Config) -> demo_net.DemoNet:
 
 def main(
     split: Annotated[str, typer.Option(help=f"one of {', '.join(SPLITS)}")] = "report",
-    starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}")] = ",".join(DEFAULT_STARTS),
-    methods: Annotated[str, typer.Option(help=f"comma-separated from {', '.join((*VARIANTS, *METHODS))}")] = "",
+    starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}")] = ",".join(METHODS_OF),
+    methods: Annotated[
+        str, typer.Option(help=f"comma-separated from {', '.join((*VARIANTS, *METHODS))}; default: by start")
+    ] = "",
     change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
     workers: Annotated[int, typer.Option(min=1, help="processes")] = 2,
     resume: Annotated[bool, typer.Option(help="go on with the run in --out")] = False,
@@ -105,21 +111,22 @@ def main(
 ) -> None:
     """Accuracy with learned depth."""
     console = Console(width=None if sys.stdout.isatty() else TABLE_WIDTH)
-    chosen = methods.split(",") if methods else [GARPS, GARPS_NO_FEATURES, *METHODS]
     try:
-        unknown = [name for name in chosen if name not in (*VARIANTS, *METHODS)]
+        named = methods.split(",") if methods else []
+        unknown = [name for name in named if name not in (*VARIANTS, *METHODS)]
         unknown += [name for name in starts.split(",") if name not in STARTS]
         if unknown:
             raise ValueError(f"no method or start {', '.join(unknown)}: expected some of --help")
         config = changed_config(Config.preset("demo_net"), change or [])
-        options = {"split": split, "methods": chosen, "starts": starts, "settings": config.settings(), "seed": seed}
+        chosen = {start: named or METHODS_OF.get(start, METHODS_OF["none"]) for start in starts.split(",")}
+        options = {"split": split, "methods": chosen, "settings": config.settings(), "seed": seed}
         log = RowLog(out, options, resume)
         pairs = load(split, rooms, console, workers)
     except (ValueError, GarpsError) as error:
         console.print(str(error), soft_wrap=True)
         raise typer.Exit(2) from None
     facts: Row = {"depth": DEPTH, "split": split, "seed": seed, **machine_facts()} | {"settings": config.settings()}
-    _run(pairs, config, starts.split(","), chosen, seed, log, workers, console)
+    _run(pairs, config, chosen, seed, log, workers, console)
     print_tables(console, log.rows, facts)
     found = list(bars(log.rows))
     print_bars(console, found)
@@ -133,19 +140,18 @@ def main(
 def _run(
     pairs: Sequence[Pair],
     config: Config,
-    starts: Sequence[str],
-    methods: Sequence[str],
+    methods: Mapping[str, Sequence[str]],
     seed: int,
     log: RowLog,
     workers: int,
     console: Console,
 ) -> None:
     """Rows of the pairs that the log does not have yet."""
-    missing = [pair for pair in pairs if (DEPTH, pair.set, starts[-1], pair.id) not in log.done]
+    missing = [pair for pair in pairs if (DEPTH, pair.set, list(methods)[-1], pair.id) not in log.done]
     if not missing:
         return
     run_garps(config, missing[0], "disturbed", disturbed_prior(missing[0]))  # compiles, once for all processes
-    work = partial(evaluated, config=config, starts=starts, methods=methods, seed=seed)
+    work = partial(evaluated, config=config, methods=methods, seed=seed)
     with Progress(console=console) as bar:
         found = computed(work, missing, workers)
         for rows in (rows for of_starts in bar.track(found, len(missing), description="pairs") for rows in of_starts):

@@ -84,7 +84,7 @@ def test_a_pair_goes_through_all_of_it(tmp_path: Path, monkeypatch: pytest.Monke
     assert first.exit_code == 0, first.output
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert {(r["pair"], r["start"]) for r in run["rows"]} == {
-        (f"room{seed}_level{level_of(seed)}", start) for seed in (91_000, 91_001) for start in learned.DEFAULT_STARTS
+        (f"room{seed}_level{level_of(seed)}", start) for seed in (91_000, 91_001) for start in learned.METHODS_OF
     }
     assert {r["depth"] for r in run["rows"]} == {"demo_net"}
     table = (tmp_path / "out" / "table.md").read_text()
