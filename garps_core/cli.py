@@ -33,6 +33,12 @@ from garps_core.weights_cli import app as weights_app
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
+Settings = Annotated[
+    Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+]
+Changes = Annotated[
+    list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
     add_completion=False,
@@ -100,12 +106,8 @@ def align(
     ] = None,
     reconstruction: Annotated[str | None, typer.Option(help=f"{', '.join(METHODS)}. [auto]")] = None,
     start: Annotated[str | None, typer.Option(help=f"Initial pose: {', '.join(STARTS)}. [auto]")] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
-    ] = None,
-    settings: Annotated[
-        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
-    ] = None,
+    set_: Changes = None,
+    settings: Settings = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print everything as JSON, full precision.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Write a before/after picture (needs matplotlib).")] = None,
@@ -129,10 +131,9 @@ def align(
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    changes = set_ or []
-    method = _configured(Config(), settings, changes, options).reconstruction.method
+    method = _configured(Config(), settings, set_, options).reconstruction.method
     base = Config.preset(preset or preset_for(method, splats or any(depths)))
-    config = _configured(base, settings, changes, options)
+    config = _configured(base, settings, set_, options)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -230,9 +231,9 @@ def _uncalibrated(
     return source, target
 
 
-def _configured(base: Config, file: Path | None, changes: list[str], options: dict[str, str | None]) -> Config:
+def _configured(base: Config, file: Path | None, changes: list[str] | None, options: dict[str, str | None]) -> Config:
     given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(base if file is None else read_settings(file, base), changes).replace(given)
+    config = changed_config(base if file is None else read_settings(file, base), changes or []).replace(given)
     checked_device(config.device)
     return config
 
