@@ -85,4 +85,4 @@ METHODS: dict[str, Method] = {
     name: _method(run, name in FROM_A_START) for name, run in (FROM_A_START | FROM_NOTHING).items()
 }
 NONDETERMINISTIC: frozenset[str] = frozenset()
-"""Methods whose poses of two calls may differ in a bit: none; libraries with threads of their own have to do with one."""
+"""Methods whose poses of two calls may differ in a bit: none. Libraries that start threads have to do with one."""

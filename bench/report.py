@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run of `bench.run` leaves behind: rows, tables, plots, and pictures of pairs before and after."""
+"""What a run of `bench.run` leaves behind: rows, tables, and pictures of pairs before and after."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from rich.console import Console
 
 from bench.datasets import Pair
 from bench.evaluate import START
-from bench.paper_tables import paper_report
-from bench.plots import write_plots
 from bench.sources import config_of, with_depth_of
 from bench.tables import GARPS, Row, print_tables, write
 from garps_core import reconstruct
@@ -35,15 +33,11 @@ def write_report(
         console: where the tables are printed.
     """
     print_tables(console, rows, facts)
-    text = paper_report(rows)
-    if left_out:
-        text += "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n"
-    console.print(text, markup=False, soft_wrap=True)
-    write(out, rows, facts, "\n" + text)
-    write_plots(rows, out / "plots")
+    text = "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n" if left_out else ""
+    write(out, rows, facts, text)
     for path in write_pictures(rows, pairs, out / "pictures", int(facts.get("seed", 0))):
         console.print(f"picture: {path}", soft_wrap=True)
-    console.print(f"rows, tables, plots and pictures: {out}", soft_wrap=True)
+    console.print(f"rows, tables and pictures: {out}", soft_wrap=True)
 
 
 def write_pictures(rows: Sequence[Row], pairs: Sequence[Pair], out: Path, seed: int) -> Iterator[Path]:

@@ -7,7 +7,7 @@
     python -m bench.run --scheduler tcp://10.0.0.7:8786 --resume   # on a Dask cluster; goes on where it was stopped
 
 Into --out go rows.jsonl as they come, then rows.csv, run.json (machine, versions, commit, seeds, settings), tables in
-table.md, plots and pictures. Pairs are independent: any number of processes gives the same rows in the same order.
+table.md, and pictures. Pairs are independent: any number of processes gives the same rows in the same order.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def main(
     workers: Annotated[int, typer.Option(min=1, help="processes")] = 2,
     scheduler: Annotated[str, typer.Option(help="address of a Dask scheduler, instead of processes here")] = "",
     resume: Annotated[bool, typer.Option(help="go on with the run in --out: finished pairs are skipped")] = False,
-    out: Annotated[Path, typer.Option(help="folder of rows, tables, plots and pictures")] = Path("out/run"),
+    out: Annotated[Path, typer.Option(help="folder of rows, tables and pictures")] = Path("out/run"),
     seed: Annotated[int, typer.Option(help="of disturbances and spoilt depth")] = 0,
     list_: Annotated[bool, typer.Option("--list", help="print the names of methods and stop")] = False,
 ) -> None:

@@ -55,6 +55,8 @@ def rows_in(out: Path) -> list[dict]:
 
 
 def test_every_method_runs_and_twice_the_same(folder: Path, tmp_path: Path) -> None:
+    for library in ("open3d", "small_gicp", "kiss_matcher", "pycolmap", "cpd_pytorch"):
+        pytest.importorskip(library)
     words = ["--data", f"pairs={folder}", "--depth", "given", "--starts", "disturbed", "--methods", "garps,peers"]
     words += ["--workers", "1", "--out"]
     code, printed = called(*words, tmp_path / "first")
