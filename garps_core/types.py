@@ -161,10 +161,10 @@ class PoseEstimate:
     """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: depth (the network's), reconstruct, initialise, align."""
-    depth_from: str = "given"
-    """Where the views' depth comes from, for people; "given" = with the views, or by whoever made the mixtures."""
     estimated_fx_px: tuple[float | None, float | None] = (None, None)
     """Focal lengths of source and target where they are a network's estimate; None = the intrinsics were given."""
+    depth_from: str = "given"
+    """Where the views' depth comes from, for people; "given" = with the views, or by whoever made the mixtures."""
 
     @property
     def ok(self) -> bool:

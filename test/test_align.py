@@ -34,7 +34,7 @@ PUBLIC = {
     "Mixture": ["means", "covariances", "weights", "colours", "labels", "frustum"],
     "PoseEstimate": [
         "status", "reason", "T_target_source", "covariance", "initial", "overlap", "iterations", "objective", "quality",
-        "agreement", "seconds", "estimated_fx_px",
+        "agreement", "seconds", "estimated_fx_px", "depth_from",
     ],
     "Prior": ["T_target_source", "covariance", "origin", "reason"],
     "ReconstructionError": None,

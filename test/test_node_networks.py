@@ -57,6 +57,7 @@ def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
         before = node.log().split("ready")[0]
         assert "loaded demo_net (a demonstration: " in before and "demo_net is a demonstration: " in before
         shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
+        assert finding(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"].startswith("demo_net (a demonstration: ")
     estimate = offline(shots, [], preset="demo_net")
     assert_equal(pose, estimate)
