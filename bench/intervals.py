@@ -60,3 +60,14 @@ def paired_difference(
     found = statistic(a[chosen], axis=1) - statistic(b[chosen], axis=1)
     low, high = np.quantile(found, [(1 - level) / 2, (1 + level) / 2])
     return Difference(float(statistic(a, axis=0) - statistic(b, axis=0)), float(low), float(high))
+
+
+def relative_change(
+    ours: npt.ArrayLike, theirs: npt.ArrayLike, level: float = 0.95, draws: int = DRAWS, seed: int = 0
+) -> Difference:
+    """Mean of `ours` over that of `theirs`, less 1, with its interval over resampled pairs; as `paired_difference`."""
+    a, b = np.asarray(ours, float), np.asarray(theirs, float)
+    paired_difference(a, b, draws=1)  # raises what it raises
+    chosen = np.random.default_rng(seed).integers(len(a), size=(draws, len(a)))
+    low, high = np.quantile(a[chosen].mean(axis=1) / b[chosen].mean(axis=1) - 1, [(1 - level) / 2, (1 + level) / 2])
+    return Difference(float(a.mean() / b.mean() - 1), float(low), float(high))

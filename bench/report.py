@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from bench.ablations import ablation_tables
 from bench.datasets import Pair
 from bench.evaluate import START
 from bench.sources import config_of, with_depth_of
@@ -33,8 +34,11 @@ def write_report(
         console: where the tables are printed.
     """
     print_tables(console, rows, facts)
-    text = "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n" if left_out else ""
-    write(out, rows, facts, text)
+    text = ablation_tables(rows)
+    if left_out:
+        text += "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n"
+    console.print(text, markup=False, soft_wrap=True)
+    write(out, rows, facts, "\n" + text)
     for path in write_pictures(rows, pairs, out / "pictures", int(facts.get("seed", 0))):
         console.print(f"picture: {path}", soft_wrap=True)
     console.print(f"rows, tables and pictures: {out}", soft_wrap=True)
