@@ -20,7 +20,7 @@ from garps_core.types import View
 
 OUTLIERS = 0.1
 """The usual share w of the uniform part. With 0.6, nearer to what two views do not share, errors on rooms with true
-depth are a fifth, on monocular depth four fifths."""
+depth are a fifth; on monocular depth they stay as large."""
 POINTS = 1000
 ITERATIONS = 200
 """Most pairs are at rest after 100."""

@@ -13,7 +13,7 @@ from garps_core.checks import Float64Array
 from garps_core.types import View
 
 LENGTH = "depth"
-""""depth": the length is the median of measured / triangulated depth, over all points in both views. "none": |t| is 1,
+"""With "depth" it is the median of measured / triangulated depth, over all points in both views; with "none" it is 1,
 for tables of rotation and direction alone, which owe nothing to the depth."""
 
 
@@ -28,7 +28,7 @@ class Triangulated(NamedTuple):
 def with_length(T: Float64Array, seen: Sequence[Triangulated]) -> Float64Array:
     """4x4 T_target_source with its translation in metres, as `LENGTH` says.
 
-    The median, since ratios have long tails where the parallax is small; a mean weighted by parallax is no better.
+    The median, since ratios have long tails where the parallax is small; one weighted by parallax is no better.
 
     Raises:
         Failure: fewer than `MIN_INLIERS` points have trusted depth.

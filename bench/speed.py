@@ -17,6 +17,7 @@ import torch
 import typer
 from rich.console import Console
 
+from bench import registration
 from bench.datasets import DATA, Pair, available, load_pairs, scene_points
 from bench.speed_determinism import determinism_section
 from bench.speed_growth import growth_section
@@ -28,6 +29,8 @@ from bench.speed_stream import stream_section
 from bench.tables import machine_facts
 from garps_core import View
 
+PEER_THREADS = 2
+"""As many as GARPS may take; elsewhere peers get one, so that their poses are the same to the bit."""
 SECTIONS: dict[str, Callable[[Inputs], Section]] = {
     "pairs": pairs_section,
     "paper": paper_section,
@@ -80,6 +83,7 @@ def main(
     out: Annotated[Path, typer.Option(help="where the results go")] = Path("out/speed"),
 ) -> None:
     """Time against peers, the paper's solver and the memory bus; growth, determinism, peak memory."""
+    registration.THREADS = PEER_THREADS
     names, console, told = chosen(only), Console(), facts()
     console.print("; ".join(f"{name} {value}" for name, value in told.items()), markup=False)
     pairs = [room_pair()]
