@@ -17,7 +17,17 @@ def present(pattern: str) -> list[str]:
 FIGURE = ["matplotlib>=3.6"]
 WEIGHTS = ["huggingface_hub>=1.20"]  # for `garps weights fetch` alone; before, a broken connection was the end of it
 TEST = ["pytest", "pytest-cov", "hypothesis", "plyfile"]
-BENCH = ["trimesh", "embreex", "open3d-cpu", "small-gicp", "kiss-matcher", "pycolmap>=4", "cpd-pytorch", "optuna", "distributed"]
+BENCH = [
+    "trimesh",
+    "embreex",
+    "open3d-cpu",
+    "small-gicp",
+    "kiss-matcher",
+    "pycolmap>=4",
+    "cpd-pytorch",
+    "optuna",
+    "distributed",
+]
 
 setup(
     name=NAME,
