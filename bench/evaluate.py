@@ -11,7 +11,8 @@ import numpy as np
 
 from bench.baselines import METHODS
 from bench.datasets import Pair, disturbed_prior, truth_covariance
-from bench.tables import Row
+from bench.scores import camera_error_m, vcre_px
+from bench.tables import ERRORS, Row
 from bench.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
@@ -155,11 +156,13 @@ def _row(
         "true_rot_deg": metrics.rotation_error_deg(np.eye(4), truth),
     }
     if T is None:
-        return row | dict.fromkeys(("e_trans_m", "e_rot_deg", "e_3d_m"), float("inf"))
+        return row | dict.fromkeys(ERRORS, float("inf"))
     row |= {
         "e_trans_m": metrics.translation_error_m(T, truth),
         "e_rot_deg": metrics.rotation_error_deg(T, truth),
         "e_3d_m": metrics.error_3d_m(T, truth, pair.points),
+        "e_c_m": camera_error_m(T, truth),
+        "vcre_px": vcre_px(T, truth, pair.target.K, *pair.target.rgb.shape[1::-1]),
         "e_dir_deg": metrics.direction_error_deg(T, truth),
         "scale_ratio": metrics.scale_ratio(T, truth),
         "T": T[:3].ravel().tolist(),

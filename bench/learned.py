@@ -31,7 +31,7 @@ from bench.evaluate import START, STARTS, evaluate_pair, run_garps
 from bench.intervals import Difference, paired_difference
 from bench.jobs import computed
 from bench.learned_rooms import SPLITS, few_matches, load, with_learned_depth
-from bench.rgbd import TABLE_WIDTH
+from bench.run import TABLE_WIDTH
 from bench.runs import RowLog, key_of
 from bench.tables import GARPS, Row, machine_facts, print_tables, write
 from bench.variants import GARPS_NO_FEATURES, VARIANTS

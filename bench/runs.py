@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.baselines import METHODS, NEED_NO_START
-from bench.tables import Row
+from bench.tables import ERRORS, Row
 
 ROWS = "rows.jsonl"
 Key = tuple[str, str, str, str]
@@ -23,7 +23,7 @@ def key_of(row: Row) -> Key:
 
 
 class RowLog:
-    """Rows in a file, one line per pair; the first line holds the options they were made with.
+    """Rows in a file, one line per pair and depth; the first line holds the options they were made with.
 
     Args:
         folder: of the run; the file in it is `ROWS`.
@@ -42,9 +42,12 @@ class RowLog:
         folder.mkdir(parents=True, exist_ok=True)
         with self.path.open("w") as file:  # without the line that an interruption tore
             file.write(json.dumps(given) + "\n")
-        for key in dict.fromkeys(key_of(row) for row in self.rows):
-            self._append([row for row in self.rows if key_of(row) == key])
-        self.done = {key_of(row) for row in self.rows}
+        groups: dict[Key, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(key_of(row), []).append(row)
+        for group in groups.values():
+            self._append(group)
+        self.done = set(groups)
 
     def add(self, rows: Sequence[Row]) -> None:
         """The rows of one pair."""
@@ -105,7 +108,7 @@ def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
     found: dict[Key, dict[str, Row]] = {}
     for row in rows:
         if "depth" not in row:
-            raise ValueError(f"{path} has rows without depth: it was made by an earlier bench.rgbd; run its peers anew")
+            raise ValueError(f"{path} has rows without depth: it was made by an earlier version; run its peers anew")
         method = row["method"]
         if method in METHODS and (row["start"] != "features" or method in NEED_NO_START):
             found.setdefault(key_of(row), {})[method] = {"reused": commit} | _with_infinities(row)
@@ -114,5 +117,12 @@ def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
 
 def _with_infinities(row: Row) -> Row:
     """run.json holds None for infinity."""
-    errors = ("e_trans_m", "e_rot_deg", "e_3d_m")
-    return {name: float("inf") if name in errors and value is None else value for name, value in row.items()}
+    return {name: float("inf") if name in ERRORS and value is None else value for name, value in row.items()}
+
+
+def reuse_note(rows: Sequence[Row], path: Path) -> str:
+    """How many rows of peers come from an earlier run, in words."""
+    peers = [row for row in rows if row["method"] in METHODS]
+    commits = [row["reused"] for row in peers if "reused" in row]
+    origin = f"{path} (commit {', '.join(dict.fromkeys(commits)) or 'none'})"
+    return f"{len(commits)} of {len(peers)} rows of peers, times included, were not run anew but taken from {origin}."

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the pairs of a run come from, and whose depth they get."""
+"""Where the pairs of a run come from, whose depth they get, and from which starts they are run by default."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bench import bare, learned_rooms
-from bench.datasets import DATA, Pair, read_pairs, spread, with_monocular_depth
+from bench.datasets import DATA, HALVES, Pair, read_pairs, spread, with_monocular_depth
 from bench.readers import READERS, load
 from garps_core import Config
 from garps_core.reconstruct import with_depth
@@ -18,38 +18,64 @@ from garps_core.reconstruct import with_depth
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
 NAMES = (PAIRS, ROOMS, BARE, *READERS)
 """`pairs`: a folder with a pairs.json; `rooms`, `bare`: generated, into the folder; the others: `bench.readers`."""
-DEPTHS = {
-    "given": "sensor",
-    "monocular": "monocular",
-    "demo_net": "demo_net",
-    "depth_anything_v2": "monocular",
-}
+SENSOR, MONOCULAR, DEMO_NET = "sensor", "monocular", "demo_net"
+DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", DEMO_NET: "demo_net", "depth_anything_v2": "monocular"}
 """Whose depth: the set's own, the same spoilt as a network would, or a network's; and the preset that goes with it."""
+NOTHING_GIVEN = ("none", "disturbed")
+BY_DEFAULT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    PAIRS: ((SENSOR, MONOCULAR, DEMO_NET), ("features", "disturbed", "identity")),
+    BARE: ((MONOCULAR,), NOTHING_GIVEN),
+    ROOMS: ((DEMO_NET,), ("features", "disturbed", "none")),
+}
+"""Depths and starts of a source where nothing else is asked; of public sets their own depth and `NOTHING_GIVEN`."""
 
 
 def sources_there(data: Path = DATA) -> list[str]:
     """What a run takes by default: every set with a pairs.json beside the repository, and generated rooms."""
     found = sorted(path.parent for path in (data / "dev").glob("*/pairs.json"))
-    return [*(f"{PAIRS}={folder}" for folder in found), f"{ROOMS}={learned_rooms.FOLDER}"]
+    return [
+        *(f"{PAIRS}={folder}" for folder in found),
+        f"{BARE}={bare.FOLDER}",
+        f"{ROOMS}={learned_rooms.FOLDER}",
+    ]
 
 
-def pairs_of(source: str, limit: int | None, workers: int, console: Console) -> list[Pair]:
-    """The pairs of NAME=FOLDER; of a public set those whose files are all there, the others are printed.
-
-    Raises:
-        ValueError: no such name, not of that form, or files that are not what they should be.
-        FileNotFoundError: no pairs.json, or an image in it that is not there.
-    """
+def named(source: str) -> tuple[str, Path]:
+    """NAME=FOLDER in two. Raises ValueError on another form or name."""
     name, equals, folder = source.partition("=")
     if not equals or name not in NAMES:
         raise ValueError(f"--data is {source!r}: expected NAME=FOLDER, NAME one of {', '.join(NAMES)}")
-    path = Path(folder)
+    return name, Path(folder)
+
+
+def defaults_of(source: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Depths and starts that a source is run with where nothing else is asked."""
+    return BY_DEFAULT.get(named(source)[0], ((SENSOR,), NOTHING_GIVEN))
+
+
+def pairs_of(source: str, limit: int | None, workers: int, console: Console, half: str = "all") -> list[Pair]:
+    """The pairs of NAME=FOLDER; of a public set those whose files are all there, the others are printed.
+
+    Args:
+        source: NAME=FOLDER.
+        limit: at most so many, spread evenly.
+        workers: processes that make rooms.
+        console: for bars, and what is left out.
+        half: of a folder with a pairs.json; of generated rooms "dev" takes those to tune on, else those to report.
+    Raises:
+        ValueError: no such name or half, not of that form, or files that are not what they should be.
+        FileNotFoundError: no pairs.json, or an image in it that is not there.
+    """
+    if half not in HALVES:
+        raise ValueError(f"half is {half!r}: expected one of {', '.join(HALVES)}")
+    name, path = named(source)
+    split = "tune" if half == "dev" else "report"
     if name == PAIRS:
-        return read_pairs(path.resolve().name, path, limit)
+        return read_pairs(path.resolve().name, path, limit, half)
     if name == ROOMS:
-        return learned_rooms.load("report", path, console, workers, limit)
+        return learned_rooms.load(split, path, console, workers, limit)
     if name == BARE:
-        return spread(bare.load_with_bar("report", path, console).pairs, limit)
+        return spread(bare.load_with_bar(split, path, console).pairs, limit)
     skipped: list[str] = []
     found = load(name, path, limit, skipped)
     for text in skipped:
@@ -57,13 +83,11 @@ def pairs_of(source: str, limit: int | None, workers: int, console: Console) -> 
     return found
 
 
-def usable(pairs: Sequence[Pair], depth: str) -> tuple[list[Pair], list[Pair]]:
-    """Those that have what a depth of `DEPTHS` needs, and those that have not."""
-    from_set = depth in ("given", "monocular")
-    whole = [not from_set or (pair.source.depth is not None and pair.target.depth is not None) for pair in pairs]
-    return [p for p, has in zip(pairs, whole, strict=True) if has], [
-        p for p, has in zip(pairs, whole, strict=True) if not has
-    ]
+def usable(pair: Pair, depth: str) -> bool:
+    """Whether a pair has what a depth of `DEPTHS` needs. Bare rooms come with monocular-like depth, and no other."""
+    if depth not in (SENSOR, MONOCULAR):
+        return True
+    return pair.source.depth is not None and pair.target.depth is not None and (depth, pair.set) != (SENSOR, bare.SET)
 
 
 def config_of(depth: str) -> Config:
@@ -73,10 +97,27 @@ def config_of(depth: str) -> Config:
 
 def with_depth_of(pair: Pair, depth: str, seed: int = 0) -> Pair:
     """The pair with a depth of `DEPTHS`. Raises WeightsError where the network's weights are not installed."""
-    if depth == "given":
+    if depth == SENSOR or (depth, pair.set) == (MONOCULAR, bare.SET):
         return pair
-    if depth == "monocular":
+    if depth == MONOCULAR:
         return with_monocular_depth(pair, seed)
     config = Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth})
     source, target = with_depth([pair.source, pair.target], config)
     return replace(pair, source=source, target=target)
+
+
+def overlap_of(pair: Pair) -> float | None:
+    """Share of the pixels whose surface the other camera sees, 0..1, from the pair's own depth; None without any."""
+    from bench.rooms.pair import mutual_overlap
+
+    if not usable(pair, SENSOR):
+        return None
+    (a, b), T = (pair.source, pair.target), pair.T_target_source
+    return mutual_overlap(a.depth, b.depth, a.K, b.K, T)
+
+
+def without_depth(pairs: Sequence[Pair], depth: str) -> list[str]:
+    """What cannot be run with a depth, in words."""
+    lacking = [pair for pair in pairs if not usable(pair, depth)]
+    counts = {name: sum(pair.set == name for pair in lacking) for name in dict.fromkeys(pair.set for pair in lacking)}
+    return [f"{name}, depth {depth}: {n} pairs come without it for both views" for name, n in counts.items()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From rows (one per depth, pair, start and method, as `bench.rgbd` makes them) to summaries, tables and files."""
+"""From rows (one per depth, pair, start and method, as `bench.run` makes them) to summaries, tables and files."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from garps_core import metrics
 
 Row = dict[str, Any]
 GARPS = "garps"
+ERRORS = ("e_trans_m", "e_rot_deg", "e_3d_m", "e_c_m", "vcre_px")
+"""What is infinite where there is no pose."""
 SUCCESS_M, SUCCESS_DEG = 0.05, 2.0
 MAP_FREE_M, MAP_FREE_DEG = 0.25, 5.0
 """What the Map-free relocalisation benchmark calls a usable pose."""

@@ -23,6 +23,7 @@ from garps_core.reconstruct import mixtures_of, with_depth
 
 GARPS = "garps"
 GARPS_NO_FEATURES = "garps-no-features"
+GARPS_PAPER = "garps-paper"
 VAGUE = 1e4
 """Factor on the start's covariance that leaves it next to no say."""
 
@@ -62,6 +63,11 @@ def last_rung(config: Config) -> Config:
     return replace(config, alignment=replace(settings, **ladders))
 
 
+def as_published(config: Config) -> Config:
+    """The paper's own settings for lifting and alignment, on the depth and from the start that there are."""
+    return replace(Config.preset("paper"), reconstruction=config.reconstruction, start=config.start)
+
+
 VARIANTS: dict[str, Variant] = {
     GARPS: Variant("as it is"),
     GARPS_NO_FEATURES: Variant("no features", {"start.features": False}),
@@ -78,6 +84,7 @@ VARIANTS: dict[str, Variant] = {
     "garps-no-ray-uncertainty": Variant(
         "depth without noise", {"lifting.noise_floor_m": 5e-4, "lifting.noise_linear": 0.0}
     ),
+    GARPS_PAPER: Variant("the paper's settings, from the same start", settings=as_published),
     "garps-no-depth-errors": Variant("depth maps' own errors are not solved for", {"alignment.depth_errors": False}),
 }
 """By the name that stands in tables."""

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Markdown tables in the layout of the paper, and those it lacks: of all pairs, paired, by category, by length.
+
+Rows are those of `bench.evaluate`. The paper's numbers are over each method's own successes, and cannot be compared
+where methods fail on different pairs; so every table says how many pairs and failures it is of, and where the unit of
+the true translations comes from. The best of a column, as rounded, is bold. A table of no rows is empty text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import binomtest
+
+from bench.intervals import paired_difference, relative_change
+from bench.scores import INF, THRESHOLDS_DEG
+from bench.statistics_blocks import (
+    MAA_DEG,
+    all_pairs,
+    common_subset,
+    errors_of,
+    length_unit,
+    matched,
+    median_of_all,
+    methods_of,
+    own_successes,
+    pair_of,
+    rows_of,
+    scale_sources,
+    spread,
+)
+from bench.tables import GARPS, Row
+
+ERRORS = {"e_trans_m": "E_trans", "e_rot_deg": "E_rot", "e_3d_m": "E_3D"}
+ALL_PAIRS = {"e_rot_deg": "E_rot", "e_dir_deg": "E_dir", "e_trans_m": "E_trans", "e_3d_m": "E_3D"}
+DIGITS_M, DIGITS_DEG, DIGITS_S = 4, 3, 3
+TIME = (
+    "one call from the images, without the depth that the pair has and without a start that is given; mean over the "
+    "pairs, failures too"
+)
+"""What is inside the seconds of rows that `bench.evaluate` made."""
+LENGTH_FROM_DEPTH = ("five-point", "colmap", "colmap-relaxed")
+"""Methods that find a direction, and take the length of t from the depth of the pair (`bench.metres`)."""
+COUNTS = ("n poses", "Failures")
+LENGTHS = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, INF)
+COMMON_SHARE = 0.5
+"""A method that solved less of the pairs is left out of the common subset, which it would empty."""
+
+
+def paper_tables(rows: Sequence[Row], time: str = TIME, method: str = GARPS) -> str:
+    """Every table, for each depth, set and start in order of first appearance.
+
+    Args:
+        rows: of any number of sets.
+        time: what is inside the seconds, in words.
+        method: the one that others are compared with; its variants are called method-something.
+    """
+    text = []
+    for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
+        part = [row for row in rows if pair_of(row)[:3] == place]
+        shared, which = _common(part)
+        tables = [mean_table(part, time), median_table(part), all_pairs_table(part)]
+        tables += [mean_table(shared, time, which), median_table(shared, which)]
+        tables += [ablation_table(part, method), difference_table(part, method)]
+        tables += [category_table(part), length_table(part)]
+        depth, name, start = place
+        text += [f"### {name}, depth {depth or 'given'}, start {start}\n", *filter(None, tables)]
+    return "\n".join(text)
+
+
+def _common(rows: Sequence[Row]) -> tuple[list[Row], str]:
+    """The common subset of the methods that solve enough pairs, and what it is, in words."""
+    least = COMMON_SHARE * len({pair_of(row) for row in rows})
+    able = [name for name in methods_of(rows) if sum(row["found"] for row in rows_of(rows, name)) >= least]
+    out = [name for name in methods_of(rows) if name not in able]
+    without = f", without {', '.join(out)}, which solved less than {100 * COMMON_SHARE:g} %" if out else ""
+    return common_subset(rows, able), f"pairs that all methods solved{without}"
+
+
+def mean_table(rows: Sequence[Row], time: str = TIME, which: str = "own successes") -> str:
+    """The paper's Table 1: mean ± standard deviation (over n - 1) of a method's poses, and mean seconds per pair."""
+    seconds = [float(spread([row["seconds"] for row in rows_of(rows, m)]).mean) for m in methods_of(rows)]
+    columns = _spread_columns(rows, "mean", "std")
+    columns |= {"Time (s)": _column(seconds, DIGITS_S)}
+    caption = f"Mean pose errors ± standard deviation (over n - 1), and time per pair; {which}"
+    return _by_method(caption, rows, columns, f" Time: {time}.")
+
+
+def median_table(rows: Sequence[Row], which: str = "own successes") -> str:
+    """The paper's Table 2: median ± half the interquartile range of a method's poses."""
+    return _by_method(f"Median pose errors ± 0.5 IQR; {which}", rows, _spread_columns(rows, "median", "half_iqr"))
+
+
+def all_pairs_table(rows: Sequence[Row]) -> str:
+    """Medians, AUC and mAA over all pairs, failures at infinity; first what owes nothing to the scale of the truth."""
+    found = [all_pairs(rows_of(rows, name), ALL_PAIRS) for name in methods_of(rows)]
+    medians = {error: _column([line.medians[error] for line in found], _digits(error)) for error in ALL_PAIRS}
+    columns = {_heading(error, rows): medians[error] for error in ("e_rot_deg", "e_dir_deg")}
+    for i, limit in enumerate(THRESHOLDS_DEG):
+        columns[f"AUC@{limit:g}"] = _column([100 * line.auc[i] for line in found], 1, max)
+    columns[f"mAA({MAA_DEG})"] = _column([100 * line.maa for line in found], 1, max)
+    ratios = [own_successes(rows_of(rows, name), "scale_ratio").median for name in methods_of(rows)]
+    columns["Length"] = [_number(ratio, DIGITS_DEG) for ratio in ratios]
+    columns |= {_heading(error, rows): medians[error] for error in ("e_trans_m", "e_3d_m")}
+    end = " AUC and mAA: of max(E_rot, E_dir), in per cent. Length: estimated |t| over the true, median of the poses."
+    return _by_method("Medians and AUC over all pairs, failures at infinity", rows, columns, end)
+
+
+def ablation_table(rows: Sequence[Row], method: str = GARPS) -> str:
+    """The paper's ablations: change of the mean errors against the full method, per cent, with 95 % intervals.
+
+    Over the pairs that a variant (method-something) and the full method both solved.
+    """
+    variants = [name for name in methods_of(rows) if name.startswith(f"{method}-")]
+    lines = []
+    for name in variants:
+        both = [pair for pair in matched(rows, name, method) if pair[0]["found"] and pair[1]["found"]]
+        lines.append([name, *(_change(both, error) for error in ERRORS), f"{len(both)}"])
+    caption = f"Ablation: relative change of the mean error against {method} [95 % of resampled pairs]"
+    shown = [row for row in rows if row["method"] in (method, *variants)]
+    return _table(caption, ["Variant", *ERRORS.values(), "n"], lines, shown)
+
+
+def _change(pairs: Sequence[tuple[Row, Row]], error: str) -> str:
+    ours, theirs = _finite_errors(pairs, error)
+    if not len(ours) or not theirs.mean() > 0:
+        return "-"
+    change = relative_change(ours, theirs)
+    return f"{100 * change.value:+.2f} % [{100 * change.low:+.2f}, {100 * change.high:+.2f}]"
+
+
+def _finite_errors(pairs: Sequence[tuple[Row, Row]], error: str) -> tuple[np.ndarray, np.ndarray]:
+    """An error of both rows of the pairs in which both have it."""
+    ours, theirs = (errors_of([pair[i] for pair in pairs], error) for i in (0, 1))
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    return ours[both], theirs[both]
+
+
+def difference_table(rows: Sequence[Row], method: str = GARPS, error: str = "e_3d_m") -> str:
+    """An error of one method less that of every other on the same pairs: median, mean, and who is better how often.
+
+    Median and mean with 95 % intervals are over the pairs that both solved. The sign test is over all pairs: a failure
+    is worse than any pose, ties say nothing. p is two-sided and not corrected for the number of methods.
+    """
+    lines = []
+    for other in methods_of(rows) if method in methods_of(rows) else ():
+        pairs = matched(rows, method, other)
+        if other == method or not pairs:
+            continue
+        ours, theirs = (errors_of([pair[i] for pair in pairs], error) for i in (0, 1))
+        better, worse = int((ours < theirs).sum()), int((ours > theirs).sum())
+        p = f"{binomtest(better, better + worse).pvalue:.2g}" if better + worse else "-"
+        lines.append([other, *_differences(*_finite_errors(pairs, error)), f"{better} / {worse}", p])
+    headings = ["Against", "n both", "Median [95 %]", "Mean [95 %]", "Better / worse", "Sign test p"]
+    caption = f"{_heading(error, rows)} of {method} less that of others, pair by pair (negative: {method} is better)"
+    end = " Sign test: over all pairs, failures at infinity; two-sided p, not corrected for the number of methods."
+    return _table(caption, headings, lines, rows, end)
+
+
+def _differences(ours: np.ndarray, theirs: np.ndarray) -> list[str]:
+    """Number of pairs; median and mean of the paired differences."""
+    if not len(ours):
+        return ["0", "-", "-"]
+    apart, zero = ours - theirs, np.zeros(len(ours))
+    return [f"{len(ours)}", *(str(paired_difference(apart, zero, statistic)) for statistic in (np.median, np.mean))]
+
+
+def category_table(rows: Sequence[Row]) -> str:
+    """Medians over all pairs, failures at infinity, of small motions, of large ones, and of what else a set tells apart."""
+    found = dict.fromkeys(row["category"] for row in rows)
+    categories = [name for name in dict.fromkeys(("small", "large", *found)) if name in found]
+    lines = []
+    for category in categories:
+        part = [row for row in rows if row["category"] == category]
+        columns = [_column(_medians(part, error), _digits(error)) for error in ERRORS]
+        for name, *cells in zip(methods_of(part), *columns, strict=True):
+            lines.append([category, name, *cells, *_counts(rows_of(part, name))])
+    headings = ["Pairs", "Method", *(_heading(error, rows) for error in ERRORS), *COUNTS]
+    return _table("Medians by category over all pairs, failures at infinity", headings, lines, rows)
+
+
+def length_table(rows: Sequence[Row], error: str = "e_3d_m", edges: Sequence[float] = LENGTHS) -> str:
+    """Median of an error over all pairs, failures at infinity, by the length of the true translation.
+
+    Args:
+        rows: those without `true_trans_m` are left out.
+        error: its name.
+        edges: of the bins, in the unit of the truth; a length on an edge belongs to the longer bin.
+    """
+    known = [row for row in rows if row.get("true_trans_m") is not None]
+    names, columns = methods_of(known), {}
+    for low, high in pairwise(edges):
+        if part := [row for row in known if low <= row["true_trans_m"] < high]:
+            text = f"{low:g} to {high:g}" if high < INF else f"from {low:g}"
+            heading = f"{text} {length_unit(rows)} (n = {len({pair_of(row) for row in part})})"
+            columns[heading] = _column([median_of_all(rows_of(part, name), error) for name in names], _digits(error))
+    caption = f"Median {_heading(error, rows)} by length of the true translation, over all pairs, failures at infinity"
+    return _by_method(caption, known, columns) if columns else ""
+
+
+def note(rows: Iterable[Row]) -> str:
+    """What stands below a table: scale of the truth per set, pairs, failures per method, borrowed lengths."""
+    rows = list(rows)
+    sets = dict.fromkeys(row["set"] for row in rows)
+    sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
+    scales = "; ".join(f"{name}: {', '.join(found)}" for name, found in sources.items())
+    failed = {name: sum(not row["found"] for row in rows_of(rows, name)) for name in methods_of(rows)}
+    failures = ", ".join(f"{name} {n} of {len(rows_of(rows, name))}" for name, n in failed.items() if n) or "none"
+    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs. Failures: {failures}."
+    borrowed = [name for name in methods_of(rows) if name in LENGTH_FROM_DEPTH]
+    return text + (f" Length of t from depth: {', '.join(borrowed)}." if borrowed else "")
+
+
+def _by_method(caption: str, rows: Sequence[Row], columns: dict[str, list[str]], end: str = "") -> str:
+    """A line per method: its cell of every column, poses and failures."""
+    cells = zip(*columns.values(), strict=True)
+    lines = [[name, *line, *_counts(rows_of(rows, name))] for name, line in zip(methods_of(rows), cells, strict=True)]
+    return _table(caption, ["Method", *columns, *COUNTS], lines, rows, end)
+
+
+def _table(caption: str, headings: list[str], lines: list[list[str]], rows: Sequence[Row], end: str = "") -> str:
+    if not lines:
+        return ""
+    text = [f"**{caption}**\n", f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    text += [f"| {' | '.join(line)} |" for line in lines]
+    return "\n".join([*text, f"\n{note(rows)}{end}\n"])
+
+
+def _counts(rows: Sequence[Row]) -> list[str]:
+    poses = sum(row["found"] for row in rows)
+    return [f"{poses}", f"{len(rows) - poses}"]
+
+
+def _spread_columns(rows: Sequence[Row], middle: str, width: str) -> dict[str, list[str]]:
+    """Of every error "middle ± width", two fields of `Spread`; with n where it is not that of the poses."""
+    columns = {}
+    for error in ERRORS:
+        digits, values, texts = _digits(error), [], []
+        for name in methods_of(rows):
+            found = own_successes(rows_of(rows, name), error)
+            values.append(float(getattr(found, middle)))
+            n = f" (n = {found.n})" if f"{found.n}" != _counts(rows_of(rows, name))[0] else ""
+            texts.append(f"{_number(values[-1], digits)} ± {_number(getattr(found, width), digits)}{n}")
+        columns[_heading(error, rows)] = _column(values, digits, texts=texts)
+    return columns
+
+
+def _medians(rows: Sequence[Row], error: str) -> list[float]:
+    return [median_of_all(rows_of(rows, name), error) for name in methods_of(rows)]
+
+
+def _column(
+    values: Sequence[float], digits: int, best: Callable[..., float] = min, texts: Sequence[str] | None = None
+) -> list[str]:
+    """Cells (default: the values themselves), the best ones as rounded in bold."""
+    shown = [_number(value, digits) for value in values]
+    finite = [value for value in values if np.isfinite(value)]
+    top = _number(best(finite), digits) if finite else None
+    return [f"**{text}**" if number == top else text for text, number in zip(texts or shown, shown, strict=True)]
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.{digits}f}"
+
+
+def _digits(error: str) -> int:
+    return DIGITS_M if error.endswith("_m") else DIGITS_DEG
+
+
+def _heading(error: str, rows: Sequence[Row]) -> str:
+    return f"{ALL_PAIRS[error]} ({length_unit(rows) if error.endswith('_m') else 'deg'})"
