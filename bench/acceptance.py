@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bars that GARPS has to clear, each as one line with its numbers and yes or no, from the rows of a full run.
 
-Rows come from `bench.rgbd`. A bar whose rows are missing is "not run", never met. "Success" is within 5 cm and 2 deg,
+Rows come from `bench.run`. A bar whose rows are missing is "not run", never met. "Success" is within 5 cm and 2 deg,
 unless 25 cm and 5 deg are named; all figures are over all pairs of a set, failures at infinity.
 """
 
@@ -16,6 +16,8 @@ from rich.table import Table
 
 from bench.bare import SET as BARE_ROOMS
 from bench.evaluate import START
+from bench.intervals import Difference, paired_difference
+from bench.learned_rooms import SET as LEARNED_ROOMS
 from bench.tables import GARPS, Row, coverage, quality_auc, summarise
 
 REGISTRATION = ("open3d-gicp", "open3d-colored", "open3d-plane", "small-gicp", "rgbd-hybrid", "rgbd-intensity")
@@ -66,7 +68,7 @@ def bars(rows: Sequence[Row]) -> list[Bar]:
     lines = _Lines(rows)
     found = [bar for name in lines.sets("sensor") for bar in _sensor(lines, name)]
     found += [bar for name in lines.sets("monocular") for bar in _monocular(lines, name)]
-    return [*found, *_bare(lines), _far_apart(_Lines(rows, "large")), *_confidence(rows)]
+    return [*found, *_bare(lines), _far_apart(_Lines(rows, "large")), *_confidence(rows), *_learned(rows)]
 
 
 def _compared(asked: str, own: float, limit: float, whose: str, unit: str = "m", larger: bool = False) -> Bar:
@@ -148,6 +150,35 @@ def _confidence(rows: Sequence[Row]) -> Iterator[Bar]:
         area, text = quality_auc(own) if own else (float("nan"), "not run")
         met = None if np.isnan(area) else area >= LEAST_AUC
         yield Bar(f"{depth}: AUC of quality >= {LEAST_AUC:g}", text, met)
+
+
+def _learned(rows: Sequence[Row]) -> Iterator[Bar]:
+    """On learned depth: surely better than a disturbed start, and not worse than a start from PnP."""
+    for start, asked in (("disturbed", "lower"), ("features", "not_higher")):
+        words = "surely lower" if asked == "lower" else "not surely higher"
+        for name, found in differences(rows, ("demo_net", LEARNED_ROOMS, start)).items():
+            title = f"demo_net, {LEARNED_ROOMS}, {start}: {name} E_3D {words} than the start's"
+            if found is None:
+                yield Bar(title, "not run", None)
+            else:
+                yield Bar(title, f"{found} m, 95 %", getattr(found, asked))
+
+
+def differences(
+    rows: Sequence[Row], table: tuple[str, str, str], method: str = GARPS, other: str = START
+) -> dict[str, Difference | None]:
+    """Median and mean of E_3D (m) of a method minus those of another, over the pairs for which the other has a pose.
+
+    Where the method itself has none, the other's pose is what its user is left with, and so counts. None without rows.
+    """
+    own = [row for row in rows if (row.get("depth"), row["set"], row["start"]) == table]
+    of = {name: {row["pair"]: row for row in own if row["method"] == name} for name in (method, other)}
+    pairs = [pair for pair, row in of[other].items() if row["found"] and pair in of[method]]
+    theirs = np.array([of[other][pair]["e_3d_m"] for pair in pairs])
+    ours = np.array([of[method][pair]["e_3d_m"] for pair in pairs])
+    ours = np.where(np.isfinite(ours), ours, theirs)
+    statistics = {"median": np.median, "mean": np.mean}
+    return {name: paired_difference(ours, theirs, what) if pairs else None for name, what in statistics.items()}
 
 
 def answer(bar: Bar) -> str:

@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.datasets import Pair
-from garps_core.models.demo_net import DemoNet, depth_of
-from garps_core.types import View
 
 
 class DepthErrors(NamedTuple):
@@ -42,17 +40,25 @@ def depth_errors(found: npt.NDArray[np.float32], true: npt.NDArray[np.float32]) 
     )
 
 
-def errors_of_views(views: Sequence[View], network: DemoNet) -> list[DepthErrors]:
-    """Of the network's depth against that of the views."""
-    found = depth_of(network, views)
-    return [depth_errors(ours, view.depth) for ours, view in zip(found, views, strict=True) if view.depth is not None]
+def errors_of_pair(found: Pair, true: Pair) -> list[DepthErrors]:
+    """Of the depth of both views against that of another version of the same pair, which has it."""
+    return [
+        depth_errors(view.depth, truth.depth)
+        for view, truth in ((found.source, true.source), (found.target, true.target))
+        if view.depth is not None and truth.depth is not None
+    ]
 
 
-def depth_table(pairs: Sequence[Pair], network: DemoNet) -> str:
-    """Markdown: errors of the network on both views of every pair, by category, and how they hang together."""
+def depth_table(pairs: Sequence[Pair], with_depth: Callable[[Pair], Pair]) -> str:
+    """Markdown: errors of depth on both views of every pair, by category, and how they hang together.
+
+    Args:
+        pairs: with their own depth, which is the truth here.
+        with_depth: gives a pair the depth in question.
+    """
     rows = ["| views | n | AbsRel | delta < 1.25 | AbsRel, scale put right | scale: median | sd, common | sd, own |"]
     rows.append("|---" * 8 + "|")
-    of_pairs = [(pair.category, errors_of_views([pair.source, pair.target], network)) for pair in pairs]
+    of_pairs = [(pair.category, errors_of_pair(with_depth(pair), pair)) for pair in pairs]
     for category in (*dict.fromkeys(pair.category for pair in pairs), "all"):
         chosen = [errors for name, errors in of_pairs if category in (name, "all")]
         found = np.array(chosen)  # (pairs, 2, 4)

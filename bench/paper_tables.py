@@ -8,14 +8,15 @@ the true translations comes from. The best of a column, as rounded, is bold. A t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import binomtest
 
-from bench.intervals import paired_difference, relative_change
-from bench.scores import INF, THRESHOLDS_DEG
+from bench.intervals import paired_difference
+from bench.scores import INF, THRESHOLDS_DEG, VCRE_PX, precision_auc
 from bench.statistics_blocks import (
     MAA_DEG,
     all_pairs,
@@ -31,7 +32,7 @@ from bench.statistics_blocks import (
     scale_sources,
     spread,
 )
-from bench.tables import GARPS, Row
+from bench.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row
 
 ERRORS = {"e_trans_m": "E_trans", "e_rot_deg": "E_rot", "e_3d_m": "E_3D"}
 ALL_PAIRS = {"e_rot_deg": "E_rot", "e_dir_deg": "E_dir", "e_trans_m": "E_trans", "e_3d_m": "E_3D"}
@@ -60,14 +61,25 @@ def paper_tables(rows: Sequence[Row], time: str = TIME, method: str = GARPS) -> 
     text = []
     for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
         part = [row for row in rows if pair_of(row)[:3] == place]
+        part, without = _with_any_pose(part)
         shared, which = _common(part)
         tables = [mean_table(part, time), median_table(part), all_pairs_table(part)]
         tables += [mean_table(shared, time, which), median_table(shared, which)]
-        tables += [ablation_table(part, method), difference_table(part, method)]
-        tables += [category_table(part), length_table(part)]
+        tables += [difference_table(part, method), category_table(part), length_table(part), map_free_table(part)]
         depth, name, start = place
-        text += [f"### {name}, depth {depth or 'given'}, start {start}\n", *filter(None, tables)]
+        text += [f"### {name}, depth {depth or 'given'}, start {start}\n", *without, *filter(None, tables)]
     return "\n".join(text)
+
+
+def _with_any_pose(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """The rows of methods with at least one pose, and of the others their most frequent reason, in words."""
+    able = {row["method"] for row in rows if row["found"]}
+    whose: dict[str, list[str]] = {}
+    for name in (name for name in methods_of(rows) if name not in able):
+        (reason, _), *_ = Counter(row["reason"].partition(":")[0] for row in rows_of(rows, name)).most_common(1)
+        whose.setdefault(reason, []).append(name)
+    lines = [f"No pose at all: {', '.join(names)} ({reason}).\n" for reason, names in whose.items()]
+    return [row for row in rows if row["method"] in able], lines
 
 
 def _common(rows: Sequence[Row]) -> tuple[list[Row], str]:
@@ -108,29 +120,6 @@ def all_pairs_table(rows: Sequence[Row]) -> str:
     return _by_method("Medians and AUC over all pairs, failures at infinity", rows, columns, end)
 
 
-def ablation_table(rows: Sequence[Row], method: str = GARPS) -> str:
-    """The paper's ablations: change of the mean errors against the full method, per cent, with 95 % intervals.
-
-    Over the pairs that a variant (method-something) and the full method both solved.
-    """
-    variants = [name for name in methods_of(rows) if name.startswith(f"{method}-")]
-    lines = []
-    for name in variants:
-        both = [pair for pair in matched(rows, name, method) if pair[0]["found"] and pair[1]["found"]]
-        lines.append([name, *(_change(both, error) for error in ERRORS), f"{len(both)}"])
-    caption = f"Ablation: relative change of the mean error against {method} [95 % of resampled pairs]"
-    shown = [row for row in rows if row["method"] in (method, *variants)]
-    return _table(caption, ["Variant", *ERRORS.values(), "n"], lines, shown)
-
-
-def _change(pairs: Sequence[tuple[Row, Row]], error: str) -> str:
-    ours, theirs = _finite_errors(pairs, error)
-    if not len(ours) or not theirs.mean() > 0:
-        return "-"
-    change = relative_change(ours, theirs)
-    return f"{100 * change.value:+.2f} % [{100 * change.low:+.2f}, {100 * change.high:+.2f}]"
-
-
 def _finite_errors(pairs: Sequence[tuple[Row, Row]], error: str) -> tuple[np.ndarray, np.ndarray]:
     """An error of both rows of the pairs in which both have it."""
     ours, theirs = (errors_of([pair[i] for pair in pairs], error) for i in (0, 1))
@@ -168,7 +157,7 @@ def _differences(ours: np.ndarray, theirs: np.ndarray) -> list[str]:
 
 
 def category_table(rows: Sequence[Row]) -> str:
-    """Medians over all pairs, failures at infinity, of small motions, of large ones, and of what else a set tells apart."""
+    """Medians over all pairs, failures at infinity: small motions, large ones, and what else a set tells apart."""
     found = dict.fromkeys(row["category"] for row in rows)
     categories = [name for name in dict.fromkeys(("small", "large", *found)) if name in found]
     lines = []
@@ -200,15 +189,45 @@ def length_table(rows: Sequence[Row], error: str = "e_3d_m", edges: Sequence[flo
     return _by_method(caption, known, columns) if columns else ""
 
 
+def map_free_table(rows: Sequence[Row]) -> str:
+    """Scores of Map-free relocalisation: camera error, VCRE, precision, and AUC over each method's own confidence.
+
+    Medians are over all pairs, not per scene; a method without a confidence has an AUC like its precision.
+    """
+    if not all("e_c_m" in row for row in rows):
+        return ""
+    names = methods_of(rows)
+    columns = {
+        f"E_c ({length_unit(rows)})": _column([median_of_all(rows_of(rows, m), "e_c_m") for m in names], DIGITS_M),
+        "VCRE (px)": _column([median_of_all(rows_of(rows, m), "vcre_px") for m in names], 1),
+    }
+    usable = {f"< {VCRE_PX:g} px": lambda row: row["vcre_px"] < VCRE_PX}
+    usable[f"< {MAP_FREE_M:g} m, {MAP_FREE_DEG:g} deg"] = lambda row: (
+        row["e_c_m"] < MAP_FREE_M and row["e_rot_deg"] < MAP_FREE_DEG
+    )
+    for what, accepts in usable.items():
+        scores = [_precision(rows_of(rows, name), accepts) for name in names]
+        columns[f"{what}: precision"] = _column([score[0] for score in scores], DIGITS_DEG, max)
+        columns[f"{what}: AUC"] = _column([score[1] for score in scores], DIGITS_DEG, max)
+    end = " AUC: of precision over recall in order of falling confidence (`quality`), all pairs in the denominator."
+    return _by_method("Scores of Map-free relocalisation, medians over all pairs", rows, columns, end)
+
+
+def _precision(rows: Sequence[Row], accepts: Callable[[Row], bool]) -> tuple[float, float]:
+    """Share of all pairs whose pose is accepted, and the area under precision and recall."""
+    found = [row for row in rows if row["found"]]
+    right = [accepts(row) for row in found]
+    confidence = [float(row.get("quality", 0.0)) for row in found]
+    return sum(right) / len(rows), precision_auc(confidence, right, len(rows) - len(found))
+
+
 def note(rows: Iterable[Row]) -> str:
-    """What stands below a table: scale of the truth per set, pairs, failures per method, borrowed lengths."""
+    """What stands below a table: scale of the truth per set, number of pairs, borrowed lengths."""
     rows = list(rows)
     sets = dict.fromkeys(row["set"] for row in rows)
     sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
     scales = "; ".join(f"{name}: {', '.join(found)}" for name, found in sources.items())
-    failed = {name: sum(not row["found"] for row in rows_of(rows, name)) for name in methods_of(rows)}
-    failures = ", ".join(f"{name} {n} of {len(rows_of(rows, name))}" for name, n in failed.items() if n) or "none"
-    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs. Failures: {failures}."
+    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs."
     borrowed = [name for name in methods_of(rows) if name in LENGTH_FROM_DEPTH]
     return text + (f" Length of t from depth: {', '.join(borrowed)}." if borrowed else "")
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a run, one function each, from the rows of `bench.evaluate` to a PNG file.
 
-Rows of one table belong into a picture: one depth, set and start (`write_plots` tells them apart). A method has the same
-colour, line and marker in every picture; colours are those of Okabe and Ito, which the colour-blind can tell apart. All
-pairs count, failures as infinite errors. No pyplot: nothing stays open.
+Rows of one table belong into a picture: one depth, set and start (`write_plots` tells them apart). A method looks the
+same in every picture; colours are those of Okabe and Ito, which the colour-blind can tell apart. All pairs count,
+failures as infinite errors. No pyplot: nothing stays open.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import binomtest, chi2
 
 from bench.scores import NAN
-from bench.statistics_blocks import errors_of, median_of_all, methods_of, pair_of, rows_of, spread
+from bench.statistics_blocks import errors_of, length_unit, median_of_all, methods_of, pair_of, rows_of, spread
 from bench.tables import GARPS, SUCCESS_DEG, SUCCESS_M, Row, is_right
 from garps_core.checks import Float64Array
 
@@ -35,7 +35,13 @@ KNOWN = (
     *("sift-pnp+small-gicp", "open3d-plane", "sift-pnp-oneway", "rgbd-hybrid", "colmap-relaxed", "open3d-colored-fast"),
 )
 """Methods whose looks do not depend on who else is in the picture; the first six have solid lines, and so on."""
-LABELS = {"e_trans_m": "E_trans (m)", "e_rot_deg": "E_rot (deg)", "e_3d_m": "E_3D (m)"}
+LABELS = {
+    "e_trans_m": "E_trans",
+    "e_rot_deg": "E_rot",
+    "e_3d_m": "E_3D",
+    "true_trans_m": "length of the true translation",
+}
+OF = ("true_trans_m", "true_overlap")
 BINS, LEAST_IN_BIN = 8, 5
 QUALITY_BINS = 10
 DPI = 130
@@ -64,25 +70,24 @@ def error_cdfs(rows: Sequence[Row], path: Path, errors: Sequence[str] = ("e_3d_m
 def error_against(rows: Sequence[Row], path: Path, of: str = "true_trans_m", error: str = "e_3d_m") -> Path:
     """Median error over bins of equally many pairs, by the length of the true translation, or another of `OF`.
 
-    What is known of a pair from the row of one method (overlap, which GARPS estimates) counts for all methods. Where
-    half of a bin's pairs failed, the median is infinite and the line has a gap.
+    Where half of a bin's pairs failed, the median is infinite and the line has a gap.
 
     Raises:
-        ValueError: no row says it.
+        NothingToDraw: no row says it.
     """
-    places = {pair_of(row): float(row[of]) for row in reversed(rows) if row.get(of) is not None}
-    values = _known(np.array(_some([*places.values()], f"rows with {of}")))
+    having = _some([row for row in rows if row.get(of) is not None], f"rows with {of}")
+    values = np.array([*{pair_of(row): round(row[of], 6) for row in having}.values()])  # equal lengths stay together
     bins = int(np.clip(len(values) // LEAST_IN_BIN, 1, BINS))
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))[1:-1]
     figure, axes = _figure(1)
-    methods = methods_of(rows)
-    for name, look in looks(methods).items():
-        own = [row for row in rows_of(rows, name) if not np.isnan(places.get(pair_of(row), NAN))]
-        x = np.array([places[pair_of(row)] for row in own])
-        bin_of = np.clip(np.searchsorted(edges, x, side="right"), 1, max(len(edges) - 1, 1))
-        groups = [[row for row, k in zip(own, bin_of, strict=True) if k == index] for index in np.unique(bin_of)]
-        y = [median_of_all(group, error) for group in groups]
-        axes[0].plot([np.median(x[bin_of == index]) for index in np.unique(bin_of)], y, label=name, **look)
+    for name, look in looks(methods_of(having)).items():
+        own = rows_of(having, name)
+        x = np.array([round(row[of], 6) for row in own])
+        bin_of = np.searchsorted(edges, x, side="right")
+        used = np.unique(bin_of)
+        groups = [[row for row, k in zip(own, bin_of, strict=True) if k == index] for index in used]
+        middles = [np.median(x[bin_of == index]) for index in used]
+        axes[0].plot(middles, [median_of_all(group, error) for group in groups], label=name, **look)
     _logarithmic(axes[0], "y")
     axes[0].set(xlabel=_label(of, rows), ylabel=f"median {_label(error, rows)}, bins of equally many pairs")
     return _saved(figure, axes, path)
@@ -100,7 +105,7 @@ def time_against_error(rows: Sequence[Row], path: Path, error: str = "e_3d_m") -
         seconds, middle = spread([row["seconds"] for row in own]).median, median_of_all(own, error)
         lacks = "" if seconds > 0 else " (no time)"
         lacks = lacks if np.isfinite(middle) else " (half failed)"
-        dot = look | {"linestyle": "", "markersize": 13 if name == GARPS else 9}
+        dot = look | {"linestyle": "", "markersize": 13 if name == GARPS else 9, "marker": look["marker"] or "o"}
         axes[0].plot(*(([], []) if lacks else ([seconds], [middle])), label=name + lacks, **dot)
     _logarithmic(axes[0], "x")
     _logarithmic(axes[0], "y")
@@ -114,7 +119,7 @@ def nees_calibration(rows: Sequence[Row], path: Path) -> Path:
     Above it covariances are too large, below it too small.
 
     Raises:
-        ValueError: no row has `nees`.
+        NothingToDraw: no row has `nees`.
     """
     having = _some([row for row in rows if row.get("nees") is not None], "rows with nees")
     figure, axes = _figure(1)
@@ -135,7 +140,7 @@ def quality_reliability(rows: Sequence[Row], path: Path, method: str = GARPS) ->
     A failure has quality 0. Quality need not be a probability: what matters is that the share rises with it.
 
     Raises:
-        ValueError: no row of the method has `quality`.
+        NothingToDraw: no row of the method has `quality`.
     """
     own = rows_of(rows, method)
     _some([row for row in own if row.get("quality") is not None], f"rows of {method} with quality")
@@ -159,7 +164,7 @@ def quality_reliability(rows: Sequence[Row], path: Path, method: str = GARPS) ->
 PLOTS: Mapping[str, Callable[[Sequence[Row], Path], Path]] = {
     "error_cdfs": error_cdfs,
     "error_by_length": error_against,
-    "error_by_overlap": lambda rows, path: error_against(rows, path, "overlap"),
+    "error_by_overlap": lambda rows, path: error_against(rows, path, "true_overlap"),
     "time_against_error": time_against_error,
     "nees_calibration": nees_calibration,
     "quality_reliability": quality_reliability,
@@ -177,3 +182,89 @@ def write_plots(rows: Sequence[Row], folder: Path) -> Iterator[Path]:
                 yield draw(part, folder / f"{file}.png")
             except NothingToDraw:
                 continue
+
+
+class NothingToDraw(ValueError):
+    """The rows lack what a picture shows."""
+
+
+def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour, line and marker of each method; those of `KNOWN` have the same in every picture."""
+    free = [name for name in methods if name not in (GARPS, START, *KNOWN)]
+    found: dict[str, dict[str, Any]] = {}
+    for name in methods:
+        if name == GARPS:
+            found[name] = {"color": "black", "linestyle": "-", "linewidth": 2.4, "marker": "*", "markersize": 9}
+        elif name == START:
+            found[name] = {"color": "0.6", "linestyle": "-", "linewidth": 1.6, "marker": ""}
+        else:
+            k = KNOWN.index(name) if name in KNOWN else len(KNOWN) + free.index(name)
+            dash = DASHES[k // len(COLOURS) % len(DASHES)]
+            found[name] = {"color": COLOURS[k % len(COLOURS)], "linestyle": dash, "linewidth": 1.3}
+            found[name] |= {"marker": MARKERS[k % len(MARKERS)], "markersize": 4.5}
+    return found
+
+
+def _some(found: list[Any], what: str) -> list[Any]:
+    if not found:
+        raise NothingToDraw(f"there are no {what}")
+    return found
+
+
+def _known(values: Float64Array) -> Float64Array:
+    """Without those that are not defined."""
+    return values[~np.isnan(values)]
+
+
+def _range(values: Float64Array) -> tuple[float, float]:
+    """Limits of a logarithmic axis: all but the outermost per cent of the finite values."""
+    positive = _some([value for value in values if 0 < value < np.inf], "errors above zero")
+    low, high = np.quantile(positive, [0.01, 0.99])
+    return float(low) / 1.2, max(float(high) * 1.2, float(low) * 2)
+
+
+def _label(name: str, rows: Sequence[Row]) -> str:
+    if name == "true_overlap":
+        return "overlap (share of pixels whose surface the other camera sees)"
+    return f"{LABELS[name]} ({length_unit(rows) if name.endswith('_m') else 'deg'})"
+
+
+def _figure(panels: int, stacked: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure without pyplot, its panels side by side or, sharing x, one above the other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    size = (8.5, 6.0) if stacked else (2.8 + 5.2 * panels, 5.2)
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    if stacked:
+        grid = figure.subplots(panels, 1, sharex=True, height_ratios=[3, *[1] * (panels - 1)])
+    else:
+        grid = figure.subplots(1, panels)
+    axes = list(np.atleast_1d(grid))
+    for axis in axes:
+        axis.grid(color="0.9")
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _logarithmic(axis: Axes, which: str, limits: tuple[float, float] | None = None) -> None:
+    """A logarithmic axis with plain numbers on it."""
+    from matplotlib.ticker import FuncFormatter
+
+    (axis.set_xscale if which == "x" else axis.set_yscale)("log")
+    if limits is not None:
+        (axis.set_xlim if which == "x" else axis.set_ylim)(limits)
+    part = axis.xaxis if which == "x" else axis.yaxis
+    part.set_major_formatter("{x:g}")
+    low, high = axis.get_xlim() if which == "x" else axis.get_ylim()
+    named = "25" if high / low < 300 else ""
+    part.set_minor_formatter(FuncFormatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in named else ""))
+
+
+def _saved(figure: Figure, axes: Sequence[Axes], path: Path) -> Path:
+    """With the legend of the first panel beside the last."""
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    figure.savefig(path, dpi=DPI)
+    return path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run of `bench.run` leaves behind: rows, tables, and pictures of pairs before and after."""
+"""What a run of `bench.run` leaves behind: rows, tables, plots, and pictures of pairs before and after."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from bench import acceptance
 from bench.ablations import ablation_tables
 from bench.datasets import Pair
+from bench.depth_errors import depth_table
 from bench.evaluate import START
-from bench.sources import config_of, with_depth_of
+from bench.paper_tables import paper_tables
+from bench.plots import write_plots
+from bench.sources import SENSOR, config_of, usable, with_depth_of
 from bench.tables import GARPS, Row, print_tables, write
 from garps_core import reconstruct
 from garps_core.figure import before_after
@@ -23,7 +27,7 @@ MAX_PICTURES = 8
 def write_report(
     out: Path, rows: Sequence[Row], facts: Row, pairs: Sequence[Pair], left_out: Sequence[str], console: Console
 ) -> None:
-    """Everything into a folder, the tables also to the console.
+    """Everything into a folder, the short tables also to the console.
 
     Args:
         out: the folder.
@@ -33,15 +37,35 @@ def write_report(
         left_out: what could not be run, in words.
         console: where the tables are printed.
     """
+    seed = int(facts.get("seed", 0))
     print_tables(console, rows, facts)
-    text = ablation_tables(rows)
-    if left_out:
-        text += "\n### Left out\n\n" + "\n".join(f"- {line}" for line in left_out) + "\n"
-    console.print(text, markup=False, soft_wrap=True)
-    write(out, rows, facts, "\n" + text)
-    for path in write_pictures(rows, pairs, out / "pictures", int(facts.get("seed", 0))):
+    found = acceptance.bars(rows)
+    answered = [bar for bar in found if bar.met is not None]
+    if answered:
+        acceptance.print_bars(console, answered)
+    short = [ablation_tables(rows), depth_tables(rows, pairs, seed), left_out_text(left_out)]
+    console.print("\n".join(filter(None, short)), markup=False, soft_wrap=True)
+    parts = [acceptance.markdown_bars(answered) if answered else "", *short, paper_tables(rows)]
+    write(out, rows, facts, "\n" + "\n".join(filter(None, parts)))
+    for path in (*write_plots(rows, out / "plots"), *write_pictures(rows, pairs, out / "pictures", seed)):
         console.print(f"picture: {path}", soft_wrap=True)
-    console.print(f"rows, tables and pictures: {out}", soft_wrap=True)
+    console.print(f"rows, tables, plots and pictures: {out}", soft_wrap=True)
+
+
+def left_out_text(left_out: Sequence[str]) -> str:
+    """Markdown of what could not be run."""
+    return "\n".join(["### Left out\n", *(f"- {line}" for line in left_out), ""]) if left_out else ""
+
+
+def depth_tables(rows: Sequence[Row], pairs: Sequence[Pair], seed: int) -> str:
+    """Markdown: how wrong the depth is that the methods got, per set with depth of its own, other than that depth."""
+    text = []
+    for depth, name in dict.fromkeys((row["depth"], row["set"]) for row in rows if row["depth"] != SENSOR):
+        own = [pair for pair in pairs if pair.set == name and usable(pair, SENSOR)]
+        if own:
+            given = depth_table(own, lambda pair, depth=depth: with_depth_of(pair, depth, seed))
+            text.append(f"**Errors of {depth} depth, {name}**\n\n{given}")
+    return "\n".join(text)
 
 
 def write_pictures(rows: Sequence[Row], pairs: Sequence[Pair], out: Path, seed: int) -> Iterator[Path]:

@@ -71,8 +71,8 @@ def auc(errors_deg: npt.ArrayLike, thresholds: Sequence[float] = THRESHOLDS_DEG)
 def mean_average_accuracy(errors_deg: npt.ArrayLike, limit_deg: int = 30) -> float:
     """mAA(limit): mean over k = 1..limit of the share of errors below k deg, 0..1. NaN without errors.
 
-    Often called AUC@30, but not the number that `auc` gives: recall is read at whole degrees. As in the code it is from,
-    an error of just k deg counts from k + 1 deg on, one of just the limit at the limit.
+    Often called AUC@30, but not the number that `auc` gives: recall is read at whole degrees. As in the code it is
+    from, an error of just k deg counts from k + 1 deg on, one of just the limit at the limit.
 
     Raises:
         ValueError: errors that are negative or NaN.

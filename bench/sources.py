@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,13 +33,17 @@ BY_DEFAULT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def sources_there(data: Path = DATA) -> list[str]:
-    """What a run takes by default: every set with a pairs.json beside the repository, and generated rooms."""
-    found = sorted(path.parent for path in (data / "dev").glob("*/pairs.json"))
+    """What a run takes by default: every set beside the repository with depth in its pairs.json, generated rooms."""
+    found = sorted(path for path in (data / "dev").glob("*/pairs.json") if _have_depth(path))
     return [
-        *(f"{PAIRS}={folder}" for folder in found),
+        *(f"{PAIRS}={os.path.relpath(path.parent)}" for path in found),
         f"{BARE}={bare.FOLDER}",
         f"{ROOMS}={learned_rooms.FOLDER}",
     ]
+
+
+def _have_depth(path: Path) -> bool:
+    return all("depth0" in record and "depth1" in record for record in json.loads(path.read_text())["pairs"])
 
 
 def named(source: str) -> tuple[str, Path]:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("embreex")
 
-from bench import run, sources
+from bench import repeat, run, sources
 from bench.baselines import METHODS
 from bench.rooms import make_pair
 from garps_core import Config
@@ -25,7 +25,15 @@ TIMES = ("seconds",)
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two pairs with depth, and one without."""
-    place = tmp_path_factory.mktemp("data") / "small_rooms"
+    place = write_rooms(tmp_path_factory.mktemp("data") / "small_rooms")
+    records = json.loads((place / "pairs.json").read_text())["pairs"]
+    blind = {name: value for name, value in records[0].items() if not name.startswith("depth")}
+    (place / "pairs.json").write_text(json.dumps({"pairs": [*records, blind | {"id": "blind"}]}))
+    return place
+
+
+def write_rooms(place: Path) -> Path:
+    """Two pairs with depth in the pairs.json layout."""
     place.mkdir()
     records = []
     for seed, level in ((7, 1), (8, 2)):
@@ -36,8 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             cv2.imwrite(str(place / f"{seed}_{k}.png"), rgb[..., ::-1])
             cv2.imwrite(str(place / f"{seed}_{k}_d.png"), np.nan_to_num(1000 * depth).astype(np.uint16))
         records.append(record)
-    blind = {name: value for name, value in records[0].items() if not name.startswith("depth")}
-    (place / "pairs.json").write_text(json.dumps({"pairs": [*records, blind | {"id": "blind"}]}))
+    (place / "pairs.json").write_text(json.dumps({"pairs": records}))
     return place
 
 
@@ -57,11 +64,11 @@ def rows_in(out: Path) -> list[dict]:
 def test_every_method_runs_and_twice_the_same(folder: Path, tmp_path: Path) -> None:
     for library in ("open3d", "small_gicp", "kiss_matcher", "pycolmap", "cpd_pytorch"):
         pytest.importorskip(library)
-    words = ["--data", f"pairs={folder}", "--depth", "given", "--starts", "disturbed", "--methods", "garps,peers"]
+    words = ["--data", f"pairs={folder}", "--depth", "sensor", "--starts", "disturbed", "--methods", "garps,peers"]
     words += ["--workers", "1", "--out"]
     code, printed = called(*words, tmp_path / "first")
     assert code == 0, printed
-    assert "small_rooms, depth given: 1 pairs come without depth of both views" in printed
+    assert "small_rooms, depth sensor: 1 pairs come without it for both views" in printed
     rows = rows_in(tmp_path / "first")
     assert {row["method"] for row in rows} == {"(start)", "garps", *METHODS}
     assert {row["pair"] for row in rows} == {"room7", "room8"}
@@ -74,12 +81,12 @@ def test_every_method_runs_and_twice_the_same(folder: Path, tmp_path: Path) -> N
 
 
 def test_a_run_that_was_stopped_goes_on(folder: Path, tmp_path: Path) -> None:
-    words = ["--data", f"pairs={folder}", "--depth", "given,monocular,demo_net", "--starts", "none", "--workers", "1"]
+    words = ["--data", f"pairs={folder}", "--depth", "sensor,monocular,demo_net", "--starts", "none", "--workers", "1"]
     words += ["--methods", "garps", "--out", str(tmp_path)]
     assert called(*words)[0] == 0
     whole = rows_in(tmp_path)
     assert [(row["depth"], row["pair"]) for row in whole if row["method"] == "garps"] == [
-        *(("given", f"room{n}") for n in (7, 8)),
+        *(("sensor", f"room{n}") for n in (7, 8)),
         *(("monocular", f"room{n}") for n in (7, 8)),
         *(("demo_net", name) for name in ("room7", "room8", "blind")),
     ]
@@ -93,7 +100,7 @@ def test_a_run_that_was_stopped_goes_on(folder: Path, tmp_path: Path) -> None:
 
 def test_a_cluster_gives_the_same_rows(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    words = ["--data", f"pairs={folder}", "--depth", "given,demo_net", "--starts", "disturbed", "--methods", "garps"]
+    words = ["--data", f"pairs={folder}", "--depth", "sensor,demo_net", "--starts", "disturbed", "--methods", "garps"]
     assert called(*words, "--workers", "1", "--out", tmp_path / "here")[0] == 0
     with running_cluster(tmp_path) as (address, _):
         code, printed = called(*words, "--scheduler", address, "--out", tmp_path / "there")
@@ -103,17 +110,17 @@ def test_a_cluster_gives_the_same_rows(folder: Path, tmp_path: Path) -> None:
 
 def test_settings_come_from_a_file(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("alignment.information: 12.5\n")
-    configs = run.configs_of(["given", "demo_net"], tmp_path / "mine.yaml", ["lifting.stride=4"])
-    for depth, preset in (("given", "sensor"), ("demo_net", "demo_net")):
+    for depth, preset in (("sensor", "sensor"), ("demo_net", "demo_net")):
         changes = {"reconstruction.method": "rgbd", "alignment.information": 12.5, "lifting.stride": 4}
-        assert configs[depth] == Config.preset(preset).replace(changes)
+        found = run.config_for(depth, tmp_path / "mine.yaml", ["lifting.stride=4"])
+        assert found == Config.preset(preset).replace(changes)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--methods", "nobody"], "no method nobody: expected some of ablations, peers, garps"),
-        (["--depth", "guess"], "no depth guess: expected some of given"),
+        (["--depth", "guess"], "no depth guess: expected some of sensor"),
         (["--starts", "somewhere"], "no start somewhere: expected some of features"),
         (["--data", "rooms"], "--data is 'rooms': expected NAME=FOLDER"),
         (["--data", "films=x"], "expected NAME=FOLDER, NAME one of pairs"),
@@ -140,7 +147,67 @@ def test_depth_of_a_network_needs_its_weights(folder: Path, tmp_path: Path, monk
     assert code == 2 and "no depth_anything weights in" in printed
 
 
-def test_what_is_run_by_default(tmp_path: Path) -> None:
-    (tmp_path / "dev" / "set").mkdir(parents=True)
-    (tmp_path / "dev" / "set" / "pairs.json").touch()
-    assert sources.sources_there(tmp_path) == [f"pairs={tmp_path / 'dev' / 'set'}", "rooms=out/learned_rooms"]
+def test_what_is_run_by_default(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sets of which every pair has depth; each from its own starts, with its own depths."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dev" / "with").mkdir(parents=True)
+    records = json.loads((folder / "pairs.json").read_text())["pairs"]
+    (tmp_path / "dev" / "with" / "pairs.json").write_text(json.dumps({"pairs": records[:2]}))
+    (tmp_path / "dev" / "without").mkdir()
+    (tmp_path / "dev" / "without" / "pairs.json").write_text(json.dumps({"pairs": records}))
+    found = sources.sources_there(tmp_path)
+    assert found == ["pairs=dev/with", "bare=out/bare_rooms", "rooms=out/learned_rooms"]
+    assert [sources.defaults_of(source) for source in found] == [
+        (("sensor", "monocular", "demo_net"), ("features", "disturbed", "identity")),
+        (("monocular",), ("none", "disturbed")),
+        (("demo_net",), ("features", "disturbed", "none")),
+    ]
+    assert sources.defaults_of("mapfree=x") == (("sensor",), ("none", "disturbed"))
+
+
+def test_two_runs_are_compared(folder: Path, tmp_path: Path) -> None:
+    words = ["--data", f"pairs={folder}", "--depth", "sensor", "--starts", "disturbed", "--workers", "1"]
+    words += ["--methods", "garps,sift-pnp", "--out"]
+    assert called(*words, tmp_path / "a")[0] == called(*words, tmp_path / "b", "--limit", "2")[0] == 0
+    found = repeat.differences(repeat.rows_in(tmp_path / "a"), repeat.rows_in(tmp_path / "b"))
+    assert found == dict.fromkeys(("(start)", "garps", "sift-pnp"), repeat.Differences(1, 0, 0.0))
+    app = typer.Typer()
+    app.command()(repeat.main)
+    assert CliRunner().invoke(app, [str(tmp_path / "a"), str(tmp_path / "b")]).exit_code == 0
+    assert called(*words, tmp_path / "b", "--seed", "1")[0] == 0
+    other = CliRunner().invoke(app, [str(tmp_path / "a"), str(tmp_path / "b")])
+    assert (
+        other.exit_code == 1
+        and "| sift-pnp | 2 | 0 | 0 |" in other.output
+        and "| (start) | 2 | 0 | 0.1" in other.output
+    )
+    none = CliRunner().invoke(app, [str(tmp_path / "a"), str(tmp_path / "nowhere")])
+    assert none.exit_code == 2 and "give the --out of a run" in none.output
+
+
+def test_methods_that_need_no_start_run_once(folder: Path, tmp_path: Path) -> None:
+    words = ["--data", f"pairs={folder}", "--depth", "sensor", "--starts", "features,identity", "--workers", "1"]
+    words += ["--limit", "1", "--methods", "sift-pnp,small-gicp", "--out"]
+    assert called(*words, tmp_path / "both")[0] == 0
+    rows = json.loads((tmp_path / "both" / "run.json").read_text())["rows"]
+    seconds = {name: {row["seconds"] for row in rows if row["method"] == name} for name in ("sift-pnp", "small-gicp")}
+    assert {name: len(values) for name, values in seconds.items()} == {"sift-pnp": 1, "small-gicp": 2}
+    assert [row["start"] for row in rows if row["method"] == "sift-pnp"] == ["features", "identity"]
+
+
+def test_peers_of_an_earlier_run_are_taken_over(folder: Path, tmp_path: Path) -> None:
+    words = ["--data", f"pairs={folder}", "--depth", "sensor", "--starts", "disturbed", "--workers", "1"]
+    words += ["--methods", "garps,small-gicp", "--out"]
+    assert called(*words, tmp_path / "first")[0] == 0
+    earlier = tmp_path / "first" / "run.json"
+    code, printed = called(*words, tmp_path / "again", "--reuse-peers", earlier)
+    assert code == 0, printed
+    assert "2 of 2 rows of peers, times included, were not run anew" in " ".join(printed.split())
+    of = {
+        out: {row["pair"]: row for row in rows_in(tmp_path / out) if row["method"] == "small-gicp"}
+        for out in ("first", "again")
+    }
+    assert all(row.pop("reused") for row in of["again"].values())
+    assert of["again"] == of["first"]
+    code, printed = called(*words, tmp_path / "first", "--reuse-peers", earlier)
+    assert code == 2 and "would be overwritten" in printed

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from bench import acceptance, evaluate, plan, runs, tables
+from bench import acceptance, evaluate, runs, sources, tables
 from bench.baselines import METHODS
 
 INF = float("inf")
@@ -60,9 +60,9 @@ def full_rows(garps=0.01, peers=0.02):
     """Every table of a full run, one right GARPS and as many worse peers."""
     rows = []
     for depth in ("sensor", "monocular"):
-        tables_of_depth = [("hololens_lounge", start) for start in plan.STARTS]
+        tables_of_depth = [("hololens_lounge", start) for start in sources.BY_DEFAULT[sources.PAIRS][1]]
         if depth == "monocular":
-            tables_of_depth += [("bare_rooms", start) for start in plan.BARE_STARTS]
+            tables_of_depth += [("bare_rooms", start) for start in sources.BY_DEFAULT[sources.BARE][1]]
         for name, start in tables_of_depth:
             where = {"depth": depth, "set": name, "start": start}
             for k in range(20):
@@ -74,6 +74,10 @@ def full_rows(garps=0.01, peers=0.02):
                 for method in METHODS:
                     far = name == "bare_rooms" or k > 16
                     rows.append(made_row(method, 0.4 if far else peers, pair=str(k), **where))
+    for start in ("features", "disturbed"):
+        where = {"depth": "demo_net", "set": "learned_rooms", "start": start}
+        for k in range(20):
+            rows += [made_row("(start)", 0.12, pair=str(k), **where), made_row("garps", garps, pair=str(k), **where)]
     return rows
 
 
@@ -81,7 +85,7 @@ def test_acceptance_is_met_by_rows_that_are_better_everywhere():
     found = acceptance.bars(full_rows())
     failed = [bar for bar in found if not bar.met and "P90 of E_3D <= that of (start)" not in bar.asked]
     assert failed == []
-    assert len(found) == 3 + 2 + 4 + 4 + 4
+    assert len(found) == 3 + 2 + 4 + 4 + 4 + 4
     assert found[0].numbers == "0.01 against 0.02 m (open3d-gicp)"
 
 
@@ -161,19 +165,6 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
         runs.reusable_rows(tmp_path / "old.json", 0)
     with pytest.raises(ValueError, match=r"no run\.json"):
         runs.reusable_rows(tmp_path / "none.json", 0)
-
-
-def test_plan_of_a_full_run(monkeypatch, tmp_path):
-    monkeypatch.setattr(plan, "available", lambda data: ["hololens_lounge", "tum_fr1_rpy"])
-    assert len(plan.parts(True, False, [], [], "all", tmp_path)) == 2 * 2 * 3 + 2
-    assert plan.parts(True, False, [], ["none"], "all", tmp_path) == [("monocular", "bare_rooms", "none")]
-    assert {part.depth for part in plan.parts(False, False, [], [], "all", tmp_path)} == {"sensor"}
-    for wrong, told in (((True, True, [], []), "leave out"), ((False, False, ["x"], []), "no set or start x")):
-        with pytest.raises(ValueError, match=told):
-            plan.parts(*wrong, "all", tmp_path)
-    monkeypatch.setattr(plan, "available", lambda data: [])
-    with pytest.raises(ValueError, match="--data"):
-        plan.parts(False, False, [], [], "all", tmp_path)
 
 
 def test_known_rows_of_peers_are_taken_over():

@@ -4,8 +4,11 @@
 import math
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from garps_core import Config
+from garps_core.settings import read_settings
 
 pytest.importorskip("optuna")
 from bench import tune
@@ -37,7 +40,41 @@ def test_failures_and_overconfidence_cost():
     assert tune.loss_of([[row | {"nees": 1.0} for row in rows()]]) == pytest.approx(right + 0.5), "too careful"
 
 
-def test_an_unknown_depth_is_named(capsys):
-    with pytest.raises(Exception, match="2"):
-        tune.main(depth="sonar", trials=0)
-    assert "'sonar': expected one of sensor, monocular" in " ".join(capsys.readouterr().out.split())
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--depth", "sonar"], "'sonar': expected one of sensor, monocular, demo_net"),
+        (["--depth", "demo_net", "--data", "pairs=x"], "no data to tune demo_net on: give --data rooms=FOLDER"),
+        (["--data", "x"], "expected NAME=FOLDER"),
+        (["--data", "pairs=nowhere"], "No such file"),
+    ],
+)
+def test_mistakes_are_one_line(words, message, tmp_path):
+    code, printed = called(*words, "--out", tmp_path)
+    assert code == 2 and message in printed and "Traceback" not in printed
+
+
+def called(*words):
+    app = typer.Typer()
+    app.command()(tune.main)
+    found = CliRunner().invoke(app, [str(word) for word in words])
+    assert found.exception is None or isinstance(found.exception, SystemExit), found.exception
+    return found.exit_code, " ".join(found.output.split())
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_study_goes_on_and_leaves_settings_that_load(tmp_path):
+    """Two rooms, of which one decides and the other is reported on; a trial, and one more of the same study."""
+    pytest.importorskip("embreex")
+    from test_bench_run import write_rooms
+
+    words = ["--data", f"pairs={write_rooms(tmp_path / 'rooms')}", "--trials", "1", "--out", tmp_path / "out"]
+    code, printed = called(*words)
+    assert code == 0 and "1 trials, best" in printed, printed
+    code, printed = called(*words)
+    assert code == 0 and "2 trials, best" in printed and "held-out: loss" in printed, printed
+    settings = read_settings(tmp_path / "out" / "sensor.yaml", Config()).settings()
+    assert {name for name, value in Config().settings().items() if settings[name] != value} <= set(
+        tune.SPACES["sensor"]
+    )
+    assert called("--data", f"pairs={tmp_path / 'rooms'}", "--trials", "0", "--out", tmp_path / "out")[0] == 0

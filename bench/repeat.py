@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far two runs of `bench.run` differ on the pairs that both hold, by method: nothing, if all is as it should be.
+
+python -m bench.run --limit 5 --out out/again
+python -m bench.repeat out/run out/again
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from bench.runs import ROWS, key_of
+from bench.tables import Row
+
+
+class Differences(NamedTuple):
+    """Of a method: answers that both runs hold, those that only one has a pose for, largest difference of a number."""
+
+    answers: int
+    one_sided: int
+    largest: float
+
+
+def rows_in(folder: Path) -> list[Row]:
+    """The rows of a run. Raises ValueError where there are none."""
+    path = folder / ROWS
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist: give the --out of a run")
+    return [row for line in path.read_text().splitlines()[1:] for row in json.loads(line)]
+
+
+def differences(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Differences]:
+    """By method; numbers compared are those of poses (m, and entries of rotations) and covariances."""
+    others = {(*key_of(row), row["method"]): row for row in second}
+    found: dict[str, Differences] = {}
+    for row in first:
+        other = others.get((*key_of(row), row["method"]))
+        if other is None:
+            continue
+        n, one_sided, largest = found.get(row["method"], Differences(0, 0, 0.0))
+        largest = max([largest, *(_apart(row[k], other[k]) for k in ("T", "covariance") if k in row and k in other)])
+        found[row["method"]] = Differences(n + 1, one_sided + (row["found"] != other["found"]), largest)
+    return found
+
+
+def _apart(ours: Sequence[float], theirs: Sequence[float]) -> float:
+    return float(np.abs(np.subtract(ours, theirs)).max())
+
+
+def main(
+    first: Annotated[Path, typer.Argument(help="--out of a run")],
+    second: Annotated[Path, typer.Argument(help="--out of another")],
+) -> None:
+    """Compare two runs; exit status 1 where they differ."""
+    console = Console(soft_wrap=True)
+    try:
+        found = differences(rows_in(first), rows_in(second))
+        if not found:
+            raise ValueError(f"{first} and {second} have no pair and method in common")
+    except ValueError as error:
+        console.print(str(error))
+        raise typer.Exit(2) from None
+    console.print("| method | answers | a pose in one only | largest difference |\n|---|---|---|---|")
+    for name, line in found.items():
+        console.print(f"| {name} | {line.answers} | {line.one_sided} | {line.largest:g} |", markup=False)
+    if any(line.one_sided or line.largest for line in found.values()):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)
