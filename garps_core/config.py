@@ -100,6 +100,9 @@ class Lifting(Checked):
     pointing_sigma_rad: float = setting(
         5e-4, "error of the direction a pixel looks in (0.25 px at a focal length of 500 px)", unit="rad", low=0, high=1
     )
+    sigma_inflation: float = setting(
+        1.0, "sigmas of poses from this depth, times this: for errors of another kind (calibrated)", low=1, high=100
+    )
     edge_ratio: float = setting(
         0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
     )
@@ -263,6 +266,7 @@ def _demo_net() -> Config:
             "lifting.scale_sigma": 0.12,
             "lifting.warp_sigma": 0.15,
             "lifting.common_scale_sigma": 0.08,
+            "lifting.sigma_inflation": 2.2,
             "lifting.noise_linear": 0.1,
             "start.covariance_inflation": 15.0,
             "alignment.information": 0.3,

@@ -72,6 +72,26 @@ def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Arra
     return ros_from_twist(0.5 * (of_pose + of_pose.T), solution.T)
 
 
+def inflated_beyond(covariance: Array, known: Array, factor: float) -> Array:
+    """Covariance of an estimate whose data are noisier than it took them for, while what was known is as it said.
+
+    With sigmas `factor` times as large the data's information counts for less, but the estimate had weighted them as
+    if they were good: C' = C (f^2 D + K) C with D = C^-1 - K, which is C + (f^2 - 1) (C - C K C).
+
+    Args:
+        covariance: 6x6 C of the left twist, as computed.
+        known: 6x6 precision K of the left twist that the estimate began with.
+        factor: f, at least 1.
+    Returns:
+        6x6, nowhere less than C.
+    """
+    if factor == 1:
+        return covariance
+    of_data = covariance - covariance @ known @ covariance
+    sizes, axes = np.linalg.eigh(0.5 * (of_data + of_data.T))
+    return np.asarray(covariance + (factor**2 - 1) * (axes * np.maximum(sizes, 0.0)) @ axes.T)
+
+
 def shared_pull(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:
     """What each shared error of the source's, and of the target's, points adds to the gradient of `two_way`.
 

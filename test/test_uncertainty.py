@@ -16,7 +16,7 @@ from garps_core.geometry import se3_exp, se3_inverse
 from garps_core.lift import depth_sigma
 from garps_core.metrics import pose_error
 from garps_core.systematic import FIELD_SLOPE, shared_errors, shared_sigmas
-from garps_core.uncertainty import inverted, ros_from_twist, twist_from_ros
+from garps_core.uncertainty import inflated_beyond, inverted, ros_from_twist, twist_from_ros
 
 SMALL = {"camera": np.diag([0.5, 0.5, 1]) @ surfaces.K, "size": (60, 80)}
 FAR_POSE = np.eye(4)
@@ -149,6 +149,37 @@ def test_a_tight_prior_is_kept_and_makes_the_pose_certain(plain):
     tight = estimated(Config().replace(own), prior)
     assert (sigmas(tight) <= np.sqrt(np.diag(prior.covariance)) * 1.0001).all()
     assert (sigmas(tight) < 0.4 * sigmas(plain)).all()
+
+
+@pytest.mark.parametrize("factor", [1.5, 4.0])
+def test_noisier_data_spread_a_linear_estimate_as_the_inflated_covariance_says(factor):
+    """The estimate C (D y + K x0) with y of covariance f^2 D^-1 and x0 of K^-1, drawn."""
+    D, K = (np.linalg.inv(random_covariance(seed)) for seed in (1, 2))
+    C = np.linalg.inv(D + K)
+    rng = np.random.default_rng(0)
+    y = rng.multivariate_normal(np.zeros(6), factor**2 * np.linalg.inv(D), size=DRAWS)
+    x0 = rng.multivariate_normal(np.zeros(6), np.linalg.inv(K), size=DRAWS)
+    found = (y @ D + x0 @ K) @ C
+    assert apart(inflated_beyond(C, K, factor), np.cov(found.T)) < 0.03
+
+
+def test_inflation_leaves_what_is_known_and_never_shrinks():
+    C = random_covariance(3)
+    assert inflated_beyond(C, np.eye(6), 1.0) is C
+    np.testing.assert_allclose(inflated_beyond(C, np.zeros((6, 6)), 3.0), 9 * C, rtol=1e-12)
+    np.testing.assert_allclose(inflated_beyond(C, np.linalg.inv(C), 3.0), C, atol=1e-12)
+    wider = inflated_beyond(C, 4 * np.linalg.inv(C), 3.0)  # C holds more than the prior left: a shared error, added
+    np.testing.assert_allclose(wider, C, atol=1e-12)
+
+
+def test_an_inflated_estimate_is_the_same_pose_with_larger_sigmas(plain):
+    vague = estimated(Config().replace({"lifting.sigma_inflation": 3.0}))
+    np.testing.assert_array_equal(vague.T_target_source, plain.T_target_source)
+    assert (sigmas(vague) > 2.5 * sigmas(plain)).all() and (sigmas(vague) <= 3.0001 * sigmas(plain)).all()
+    known = disturbed(twist=np.zeros(6), covariance=np.diag([5e-5**2] * 3 + [2e-5**2] * 3))
+    own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
+    tight = estimated(Config().replace(own | {"lifting.sigma_inflation": 3.0}), known)
+    assert (sigmas(tight) <= np.sqrt(np.diag(known.covariance)) * 1.1).all(), "what was known stays"
 
 
 def test_the_direction_along_a_corridor_is_the_most_uncertain():
