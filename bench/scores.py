@@ -55,8 +55,8 @@ def auc(errors_deg: npt.ArrayLike, thresholds: Sequence[float] = THRESHOLDS_DEG)
         ValueError: errors that are negative or NaN, or a threshold that is not positive.
     """
     errors = np.sort(_errors(errors_deg))
-    if not all(threshold > 0 for threshold in thresholds):
-        raise ValueError(f"thresholds are {thresholds}: expected positive ones, deg")
+    if not all(0 < threshold < INF for threshold in thresholds):
+        raise ValueError(f"thresholds are {thresholds}: expected positive, finite ones, deg")
     if not len(errors):
         return (NAN,) * len(thresholds)
     x, recall = np.r_[0.0, errors], np.arange(len(errors) + 1) / len(errors)
@@ -135,8 +135,9 @@ def _grid() -> Float64Array:
 def _pixels(points: Float64Array, K: Float64Array, size: Float64Array) -> Float64Array:
     """Nx3 m -> Nx2 px, clipped to the image."""
     seen = points @ K.T
-    with np.errstate(divide="ignore"):
-        return np.clip(seen[:, :2] / seen[:, 2:], 0, size)
+    depth = np.where(seen[:, 2:] == 0, np.finfo(float).tiny, seen[:, 2:])  # just ahead of the lens, at the image's rim
+    with np.errstate(over="ignore"):
+        return np.clip(seen[:, :2] / depth, 0, size)
 
 
 def precision_auc(confidence: npt.ArrayLike, accepted: npt.ArrayLike, failures: int = 0) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bench import bare, learned_rooms
-from bench.datasets import DATA, HALVES, Pair, read_pairs, spread, with_monocular_depth
+from bench.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread, with_monocular_depth
 from bench.readers import READERS, load
 from garps_core import Config
 from garps_core.reconstruct import with_depth
@@ -102,14 +102,19 @@ def config_of(depth: str) -> Config:
 
 
 def with_depth_of(pair: Pair, depth: str, seed: int = 0) -> Pair:
-    """The pair with a depth of `DEPTHS`. Raises WeightsError where the network's weights are not installed."""
+    """The pair with a depth of `DEPTHS`; where no true points are known, E_3D is of those that this depth gives.
+
+    Raises:
+        WeightsError: the network's weights are not installed.
+    """
     if depth == SENSOR or (depth, pair.set) == (MONOCULAR, bare.SET):
         return pair
     if depth == MONOCULAR:
         return with_monocular_depth(pair, seed)
     config = Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth})
     source, target = with_depth([pair.source, pair.target], config)
-    return replace(pair, source=source, target=target)
+    points = pair.points if len(pair.points) else scene_points(source)
+    return replace(pair, source=source, target=target, points=points)
 
 
 def overlap_of(pair: Pair) -> float | None:

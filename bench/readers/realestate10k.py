@@ -141,7 +141,8 @@ def sample(
     Args:
         folder: of the data set, see the module.
         split: "test" (100 small and 100 large) or "validation" (10 and 10 of the training tracks).
-        scale: "raw" (the clip's unit, also for the 0.3 of the categories) or "sfm-depth" (`sfm_scale`).
+        scale: "raw" (the clip's unit, also for the 0.3 of the categories) or "sfm-depth" (`sfm_scale`), which may be
+            followed by whose depth it is, "sfm-depth:NAME".
         seed: of the order, and of the draws of "sfm-depth".
         each: pairs of each category, instead of the split's.
         skipped: a list to name unusable clips (files missing, malformed, no scale) in, instead of raising.
@@ -150,7 +151,7 @@ def sample(
         ValueError: malformed tracks, no scale, not enough clips, or a list that exists.
     """
     path = folder / list_file(split)
-    if scale not in SCALES:
+    if scale.partition(":")[0] not in SCALES:
         raise ValueError(f"scale is {scale!r}: expected one of {', '.join(SCALES)}")
     if path.exists():
         raise ValueError(f"{path} exists: a list is written once; remove it to choose anew")
@@ -182,7 +183,7 @@ def _chosen(folder: Path, split: str, scale: str, seed: int, each: int, skipped:
             room[record.category] -= 1
             records.append(record)
     if absent:
-        raise MissingFiles(absent, LAYOUT_SFM if scale == SOURCE else LAYOUT)
+        raise MissingFiles(absent, LAYOUT_SFM if scale != RAW else LAYOUT)
     if any(room.values()):
         raise ValueError(f"{folder}: {room['small']} small and {room['large']} large pairs are wanting of {each} each")
     return sorted(records, key=lambda record: (record.category != "small", record.clip))
@@ -209,10 +210,10 @@ def _record(folder: Path, track: Path, scale: str, seed: int, room: dict[str, in
     if scale == RAW and not room[category_of(T)]:
         return None
     images = [frame_file(folder, clip, camera) for camera in (source, target)]
-    more = [depth_file(folder, clip, source), points_file(folder, clip)] if scale == SOURCE else []
+    more = [depth_file(folder, clip, source), points_file(folder, clip)] if scale != RAW else []
     if absent := [file for file in (*images, *more) if not file.is_file()]:
         raise MissingFiles(absent, LAYOUT_SFM if more else LAYOUT)
-    factor = _sfm_factor(folder, clip, source, seed) if scale == SOURCE else 1.0
+    factor = _sfm_factor(folder, clip, source, seed) if scale != RAW else 1.0
     scaled = T.copy()
     scaled[:3, 3] *= factor
     (image0, size0), (image1, size1) = (_described(folder, file) for file in images)
