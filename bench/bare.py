@@ -65,9 +65,7 @@ def candidates(split: Split) -> Iterator[tuple[int, int]]:
     return ((seed, LEVELS[seed % len(LEVELS)]) for seed in split.seeds)
 
 
-def in_the_dark(
-    rgb: npt.NDArray[np.uint8], rng: np.random.Generator, blur_px: float = BLUR_PX
-) -> npt.NDArray[np.uint8]:
+def in_the_dark(rgb: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """HxWx3 uint8 -> the same scene, taken with less light by a moving camera."""
     light: npt.NDArray[Any] = (rgb / 255.0) ** GAMMA * EXPOSURE
     light = cv2.filter2D(light, -1, _streak(BLUR_PX * rgb.shape[1] / 640, rng), borderType=cv2.BORDER_REFLECT)

@@ -54,6 +54,7 @@ class Pair:
         points: Nx3 m, true scene points in the source frame; they stay true when the views' depth is spoilt.
         scale: where the unit of the translation comes from: "metres" (measured), "raw" (the set's own arbitrary unit)
             or "sfm-depth x1.234" (that unit times a factor found from a network's depth).
+        points_from: whose points those are: "truth", or the network's whose depth gave them.
         labels: HxW class of every pixel of source and target, where the truth has them.
     """
 
@@ -65,6 +66,7 @@ class Pair:
     T_target_source: Float64Array
     points: Float64Array
     scale: str = "metres"
+    points_from: str = "truth"
     labels: tuple[IntArray, IntArray] | None = None
 
 

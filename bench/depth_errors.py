@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.datasets import Pair
+from bench.tables import Row
+from garps_core.types import View
 
 
 class DepthErrors(NamedTuple):
@@ -40,34 +42,43 @@ def depth_errors(found: npt.NDArray[np.float32], true: npt.NDArray[np.float32]) 
     )
 
 
-def errors_of_pair(found: Pair, true: Pair) -> list[DepthErrors]:
-    """Of the depth of both views against that of another version of the same pair, which has it."""
-    return [
-        depth_errors(view.depth, truth.depth)
-        for view, truth in ((found.source, true.source), (found.target, true.target))
-        if view.depth is not None and truth.depth is not None
-    ]
+def errors_of_pair(found: Pair, true: Pair) -> list[DepthErrors] | None:
+    """Of the depth of source and target against that of another version of the same pair; None where it has none."""
+    views = ((found.source, true.source), (found.target, true.target))
+    try:
+        return [depth_errors(_depth(view), _depth(truth)) for view, truth in views]
+    except ValueError:
+        return None
 
 
-def depth_table(pairs: Sequence[Pair], with_depth: Callable[[Pair], Pair]) -> str:
-    """Markdown: errors of depth on both views of every pair, by category, and how they hang together.
+def _depth(view: View) -> npt.NDArray[np.float32]:
+    if view.depth is None:
+        raise ValueError("the view has no depth: expected an RGB-D view")
+    return view.depth
 
-    Args:
-        pairs: with their own depth, which is the truth here.
-        with_depth: gives a pair the depth in question.
-    """
-    rows = ["| views | n | AbsRel | delta < 1.25 | AbsRel, scale put right | scale: median | sd, common | sd, own |"]
-    rows.append("|---" * 8 + "|")
-    of_pairs = [(pair.category, errors_of_pair(with_depth(pair), pair)) for pair in pairs]
-    for category in (*dict.fromkeys(pair.category for pair in pairs), "all"):
-        chosen = [errors for name, errors in of_pairs if category in (name, "all")]
+
+def depth_tables(rows: Sequence[Row]) -> str:
+    """Markdown, a table per depth and set of rows with `depth_errors`: by category, and how both maps hang together."""
+    start = {(row["depth"], row["set"], row["pair"]): row for row in rows if row.get("depth_errors")}
+    text = []
+    for depth, name in dict.fromkeys(key[:2] for key in start):
+        own = [row for key, row in start.items() if key[:2] == (depth, name)]
+        text += [f"**Errors of {depth} depth, {name}**\n", *_lines(own), ""]
+    return "\n".join(text)
+
+
+def _lines(rows: Sequence[Row]) -> list[str]:
+    lines = ["| views | n | AbsRel | delta < 1.25 | AbsRel, scale put right | scale: median | sd, common | sd, own |"]
+    lines.append("|---" * 8 + "|")
+    for category in (*dict.fromkeys(row["category"] for row in rows), "all"):
+        chosen = [row["depth_errors"] for row in rows if category in (row["category"], "all")]
         found = np.array(chosen)  # (pairs, 2, 4)
         mean = found.reshape(-1, 4).mean(axis=0)
         scales = found[:, :, 2]
         own = scales.T[0] - scales.T[1]
         common = float(np.sqrt(max(np.var(scales.mean(axis=1)) - np.var(own) / 4, 0.0)))
-        rows.append(
+        lines.append(
             f"| {category} | {2 * len(chosen)} | {mean[0]:.3f} | {mean[1]:.3f} | {mean[3]:.3f} "
             f"| {np.exp(np.median(scales)):.3f} | {common:.3f} | {np.std(own) / math.sqrt(2):.3f} |"
         )
-    return "\n".join(rows) + "\n"
+    return lines

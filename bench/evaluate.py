@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +12,12 @@ import numpy as np
 from bench.baselines import METHODS
 from bench.datasets import Pair, disturbed_prior, truth_covariance
 from bench.scores import camera_error_m, vcre_px
-from bench.tables import ERRORS, Row
+from bench.tables import ERRORS, START, Row
 from bench.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 from garps_core.initialise import identity
 
-START = "(start)"
 STARTS = ("features", "disturbed", "identity", "none")
 """GARPS' own features + PnP; the truth off by 1 deg and 0.12 m, given as a prior; identity; or GARPS starts as it sees
 fit, and peers that need a start from the identity."""
@@ -30,7 +29,6 @@ def evaluate(
     start: str = "disturbed",
     methods: Iterable[str] = (GARPS,),
     seed: int = 0,
-    progress: Callable[[Sequence[Pair]], Iterable[Pair]] = iter,
 ) -> list[Row]:
     """Run GARPS and peers on pairs from one kind of start.
 
@@ -41,11 +39,10 @@ def evaluate(
         methods: names from `bench.variants.VARIANTS` and `bench.baselines.METHODS`. GARPS always runs where the start
             comes from it.
         seed: of the disturbance.
-        progress: wraps the pairs, for a progress bar.
     Returns: rows, per pair first "(start)", then the methods in order.
     """
     chosen = list(methods)
-    return [row for pair in progress(pairs) for row in evaluate_pair(config, pair, start, chosen, seed)]
+    return [row for pair in pairs for row in evaluate_pair(config, pair, start, chosen, seed)]
 
 
 def evaluate_pair(
@@ -58,7 +55,7 @@ def evaluate_pair(
 ) -> list[Row]:
     """`evaluate` on one pair; peers in `known` are not run, their rows are taken from there.
 
-    `garps-no-features` is left out where the start is GARPS' own features, and `garps-labels` where there are none.
+    `garps-no-features` is left out where no pose is given to start from, and `garps-labels` where there are none.
     """
     look = _Look(config, pair, start, seed)
     prior, own = look.prior, None
@@ -80,6 +77,12 @@ def evaluate_pair(
             T, reason = METHODS[name](pair.source, pair.target, np.eye(4) if start == "none" else T_start)
             rows.append(_row(look, name, T, time.perf_counter() - began, reason))
     return rows
+
+
+def failed_pair(config: Config, pair: Pair, start: str, methods: Sequence[str], reason: str) -> list[Row]:
+    """The rows of `evaluate_pair` on a pair that cannot be had, for instance for want of depth: all are failures."""
+    look = _Look(config, pair, start, 0)
+    return [_row(look, name, None, float("nan"), reason) for name in (START, *methods)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +155,8 @@ def _row(
     row: Row = {"set": pair.set, "pair": pair.id, "category": pair.category, "start": look.start, "method": method}
     row |= {"found": T is not None, "seconds": seconds, "reason": reason, "scale": pair.scale}
     row |= {
+        "points": len(pair.points),
+        "points_from": pair.points_from,
         "true_trans_m": float(np.linalg.norm(truth[:3, 3])),
         "true_rot_deg": metrics.rotation_error_deg(np.eye(4), truth),
     }

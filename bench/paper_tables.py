@@ -50,22 +50,16 @@ COMMON_SHARE = 0.5
 """A method that solved less of the pairs is left out of the common subset, which it would empty."""
 
 
-def paper_tables(rows: Sequence[Row], time: str = TIME, method: str = GARPS) -> str:
-    """Every table, for each depth, set and start in order of first appearance.
-
-    Args:
-        rows: of any number of sets.
-        time: what is inside the seconds, in words.
-        method: the one that others are compared with; its variants are called method-something.
-    """
+def paper_tables(rows: Sequence[Row]) -> str:
+    """Every table, for each depth, set and start in order of first appearance."""
     text = []
     for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
         part = [row for row in rows if pair_of(row)[:3] == place]
         part, without = _with_any_pose(part)
         shared, which = _common(part)
-        tables = [mean_table(part, time), median_table(part), all_pairs_table(part)]
-        tables += [mean_table(shared, time, which), median_table(shared, which)]
-        tables += [difference_table(part, method), category_table(part), length_table(part), map_free_table(part)]
+        tables = [mean_table(part), median_table(part), all_pairs_table(part)]
+        tables += [mean_table(shared, which), median_table(shared, which)]
+        tables += [difference_table(part), category_table(part), length_table(part), map_free_table(part)]
         depth, name, start = place
         text += [f"### {name}, depth {depth or 'given'}, start {start}\n", *without, *filter(None, tables)]
     return "\n".join(text)
@@ -91,13 +85,13 @@ def _common(rows: Sequence[Row]) -> tuple[list[Row], str]:
     return common_subset(rows, able), f"pairs that all methods solved{without}"
 
 
-def mean_table(rows: Sequence[Row], time: str = TIME, which: str = "own successes") -> str:
+def mean_table(rows: Sequence[Row], which: str = "own successes") -> str:
     """The paper's Table 1: mean ± standard deviation (over n - 1) of a method's poses, and mean seconds per pair."""
     seconds = [float(spread([row["seconds"] for row in rows_of(rows, m)]).mean) for m in methods_of(rows)]
     columns = _spread_columns(rows, "mean", "std")
     columns |= {"Time (s)": _column(seconds, DIGITS_S)}
     caption = f"Mean pose errors ± standard deviation (over n - 1), and time per pair; {which}"
-    return _by_method(caption, rows, columns, f" Time: {time}.")
+    return _by_method(caption, rows, columns, f" Time: {TIME}.")
 
 
 def median_table(rows: Sequence[Row], which: str = "own successes") -> str:
@@ -201,8 +195,8 @@ def map_free_table(rows: Sequence[Row]) -> str:
         f"E_c ({length_unit(rows)})": _column([median_of_all(rows_of(rows, m), "e_c_m") for m in names], DIGITS_M),
         "VCRE (px)": _column([median_of_all(rows_of(rows, m), "vcre_px") for m in names], 1),
     }
-    usable = {f"< {VCRE_PX:g} px": lambda row: row["vcre_px"] < VCRE_PX}
-    usable[f"< {MAP_FREE_M:g} m, {MAP_FREE_DEG:g} deg"] = lambda row: (
+    usable = {f"VCRE < {VCRE_PX:g} px": lambda row: row["vcre_px"] < VCRE_PX}
+    usable[f"E_c < {MAP_FREE_M:g} {length_unit(rows)}, E_rot < {MAP_FREE_DEG:g} deg"] = lambda row: (
         row["e_c_m"] < MAP_FREE_M and row["e_rot_deg"] < MAP_FREE_DEG
     )
     for what, accepts in usable.items():
@@ -217,7 +211,7 @@ def _precision(rows: Sequence[Row], accepts: Callable[[Row], bool]) -> tuple[flo
     """Share of all pairs whose pose is accepted, and the area under precision and recall."""
     found = [row for row in rows if row["found"]]
     right = [accepts(row) for row in found]
-    confidence = [float(row.get("quality", 0.0)) for row in found]
+    confidence = np.nan_to_num([float(row.get("quality", 0.0)) for row in found])
     return sum(right) / len(rows), precision_auc(confidence, right, len(rows) - len(found))
 
 
@@ -227,9 +221,18 @@ def note(rows: Iterable[Row]) -> str:
     sets = dict.fromkeys(row["set"] for row in rows)
     sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
     scales = "; ".join(f"{name}: {', '.join(found)}" for name, found in sources.items())
-    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs."
+    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs.{_points(rows)}"
     borrowed = [name for name in methods_of(rows) if name in LENGTH_FROM_DEPTH]
     return text + (f" Length of t from depth: {', '.join(borrowed)}." if borrowed else "")
+
+
+def _points(rows: Sequence[Row]) -> str:
+    """Over how many points E_3D is, and whose depth gave them; nothing where rows do not say."""
+    counts = [row["points"] for row in rows if row.get("points")]
+    whose = " or ".join(dict.fromkeys(row["points_from"] for row in rows if row.get("points")))
+    return (
+        f" E_3D: mean over {min(counts)} to {max(counts)} points of the source view; depth: {whose}." if counts else ""
+    )
 
 
 def _by_method(caption: str, rows: Sequence[Row], columns: dict[str, list[str]], end: str = "") -> str:

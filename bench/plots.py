@@ -18,14 +18,13 @@ from scipy.stats import binomtest, chi2
 
 from bench.scores import NAN
 from bench.statistics_blocks import errors_of, length_unit, median_of_all, methods_of, pair_of, rows_of, spread
-from bench.tables import GARPS, SUCCESS_DEG, SUCCESS_M, Row, is_right
+from bench.tables import GARPS, START, SUCCESS_DEG, SUCCESS_M, Row, is_right
 from garps_core.checks import Float64Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-START = "(start)"
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (6, 2, 1, 2)), (0, (3, 1, 1, 1, 1, 1)))
 MARKERS = "osD^vP<X>phd*"

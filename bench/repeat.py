@@ -29,11 +29,15 @@ class Differences(NamedTuple):
 
 
 def rows_in(folder: Path) -> list[Row]:
-    """The rows of a run. Raises ValueError where there are none."""
+    """The rows of a run. Raises ValueError where there are none, or a line is torn."""
     path = folder / ROWS
     if not path.is_file():
         raise ValueError(f"{path} does not exist: give the --out of a run")
-    return [row for line in path.read_text().splitlines()[1:] for row in json.loads(line)]
+    lines = path.read_text().splitlines()[1:]
+    try:
+        return [row for line in lines for row in json.loads(line)]
+    except json.JSONDecodeError:
+        raise ValueError(f"{path} is damaged, or its run was stopped: go on with it by --resume") from None
 
 
 def differences(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Differences]:
@@ -45,13 +49,20 @@ def differences(first: Sequence[Row], second: Sequence[Row]) -> dict[str, Differ
         if other is None:
             continue
         n, one_sided, largest = found.get(row["method"], Differences(0, 0, 0.0))
-        largest = max([largest, *(_apart(row[k], other[k]) for k in ("T", "covariance") if k in row and k in other)])
+        if row["found"] == other["found"]:
+            largest = max(largest, *(_apart(row.get(name), other.get(name)) for name in ("T", "covariance")))
         found[row["method"]] = Differences(n + 1, one_sided + (row["found"] != other["found"]), largest)
     return found
 
 
-def _apart(ours: Sequence[float], theirs: Sequence[float]) -> float:
-    return float(np.abs(np.subtract(ours, theirs)).max())
+def _apart(ours: Sequence[float] | None, theirs: Sequence[float] | None) -> float:
+    """Largest difference; infinite where one is missing, or not a number and the other is."""
+    if ours is None or theirs is None:
+        return 0.0 if ours is theirs else float("inf")
+    if np.array_equal(ours, theirs, equal_nan=True):
+        return 0.0
+    apart = float(np.abs(np.subtract(ours, theirs)).max())
+    return float("inf") if np.isnan(apart) else apart
 
 
 def main(

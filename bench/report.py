@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +12,25 @@ from rich.console import Console
 from bench import acceptance
 from bench.ablations import ablation_tables
 from bench.datasets import Pair
-from bench.depth_errors import depth_table
-from bench.evaluate import START
+from bench.depth_errors import depth_tables
 from bench.paper_tables import paper_tables
 from bench.plots import write_plots
-from bench.sources import SENSOR, config_of, usable, with_depth_of
-from bench.tables import GARPS, Row, print_tables, write
-from garps_core import reconstruct
+from bench.sources import with_depth_of
+from bench.tables import GARPS, START, Row, print_tables, write
+from garps_core import Config, reconstruct
 from garps_core.figure import before_after
 
 MAX_PICTURES = 8
 
 
 def write_report(
-    out: Path, rows: Sequence[Row], facts: Row, pairs: Sequence[Pair], left_out: Sequence[str], console: Console
+    out: Path,
+    rows: Sequence[Row],
+    facts: Row,
+    pairs: Sequence[Pair],
+    configs: Mapping[str, Config],
+    left_out: Sequence[str],
+    console: Console,
 ) -> None:
     """Everything into a folder, the short tables also to the console.
 
@@ -34,20 +39,22 @@ def write_report(
         rows: of all jobs.
         facts: machine, versions, commit, seeds, settings.
         pairs: those the rows are of, with their own depth.
+        configs: settings of GARPS by depth.
         left_out: what could not be run, in words.
         console: where the tables are printed.
     """
-    seed = int(facts.get("seed", 0))
     print_tables(console, rows, facts)
     found = acceptance.bars(rows)
     answered = [bar for bar in found if bar.met is not None]
     if answered:
         acceptance.print_bars(console, answered)
-    short = [ablation_tables(rows), depth_tables(rows, pairs, seed), left_out_text(left_out)]
+        console.print(f"{len(found) - len(answered)} more were not run")
+    short = [ablation_tables(rows), depth_tables(rows), left_out_text(left_out)]
     console.print("\n".join(filter(None, short)), markup=False, soft_wrap=True)
     parts = [acceptance.markdown_bars(answered) if answered else "", *short, paper_tables(rows)]
     write(out, rows, facts, "\n" + "\n".join(filter(None, parts)))
-    for path in (*write_plots(rows, out / "plots"), *write_pictures(rows, pairs, out / "pictures", seed)):
+    seed = int(facts.get("seed", 0))
+    for path in (*write_plots(rows, out / "plots"), *write_pictures(rows, pairs, configs, out / "pictures", seed)):
         console.print(f"picture: {path}", soft_wrap=True)
     console.print(f"rows, tables, plots and pictures: {out}", soft_wrap=True)
 
@@ -57,18 +64,9 @@ def left_out_text(left_out: Sequence[str]) -> str:
     return "\n".join(["### Left out\n", *(f"- {line}" for line in left_out), ""]) if left_out else ""
 
 
-def depth_tables(rows: Sequence[Row], pairs: Sequence[Pair], seed: int) -> str:
-    """Markdown: how wrong the depth is that the methods got, per set with depth of its own, other than that depth."""
-    text = []
-    for depth, name in dict.fromkeys((row["depth"], row["set"]) for row in rows if row["depth"] != SENSOR):
-        own = [pair for pair in pairs if pair.set == name and usable(pair, SENSOR)]
-        if own:
-            given = depth_table(own, lambda pair, depth=depth: with_depth_of(pair, depth, seed))
-            text.append(f"**Errors of {depth} depth, {name}**\n\n{given}")
-    return "\n".join(text)
-
-
-def write_pictures(rows: Sequence[Row], pairs: Sequence[Pair], out: Path, seed: int) -> Iterator[Path]:
+def write_pictures(
+    rows: Sequence[Row], pairs: Sequence[Pair], configs: Mapping[str, Config], out: Path, seed: int
+) -> Iterator[Path]:
     """The pair of median error of every table, at the start and as GARPS leaves it; at most `MAX_PICTURES`."""
     of_pair = {(pair.set, pair.id): pair for pair in pairs}
     starts = {_place(row): row for row in rows if row["method"] == START and row["found"]}
@@ -81,7 +79,7 @@ def write_pictures(rows: Sequence[Row], pairs: Sequence[Pair], out: Path, seed: 
             continue
         out.mkdir(parents=True, exist_ok=True)
         seen = with_depth_of(pair, row["depth"], seed)
-        mixtures = [reconstruct(view, config_of(row["depth"])) for view in (seen.source, seen.target)]
+        mixtures = [reconstruct(view, configs[row["depth"]]) for view in (seen.source, seen.target)]
         start = starts[_place(row)]
         title = (
             f"{row['set']}, {row['pair']}, depth {row['depth']}, start {row['start']}: E_3D {start['e_3d_m']:.4f} m "

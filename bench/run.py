@@ -13,7 +13,10 @@ table.md, plots and pictures. Pairs are independent: any number of processes giv
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,19 +28,23 @@ from rich.progress import Progress
 
 from bench.baselines import METHODS, NEED_NO_START
 from bench.datasets import HALVES, Pair, disturbed_prior
-from bench.evaluate import STARTS, evaluate_pair, run_garps
+from bench.depth_errors import errors_of_pair
+from bench.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
 from bench.jobs import computed
 from bench.report import write_report
 from bench.runs import Key, RowLog, reusable_rows, reuse_note
 from bench.sources import (
     DEPTHS,
     NAMES,
+    SENSOR,
     config_of,
     defaults_of,
+    named,
     overlap_of,
     pairs_of,
     sources_there,
     usable,
+    why_not,
     with_depth_of,
     without_depth,
 )
@@ -73,13 +80,16 @@ class Job:
 
 
 def rows_of(job: Job) -> list[list[Row]]:
-    """The rows of a job, start by start; methods that need no start run once.
-
-    Raises:
-        WeightsError: the depth is a network's that is not installed.
-    """
-    pair = with_depth_of(job.pair, job.depth, job.seed)
-    same = {"depth": job.depth, "true_overlap": overlap_of(job.pair)}
+    """The rows of a job, start by start; methods that need no start run once. Without depth all are failures."""
+    same: Row = {"depth": job.depth, "true_overlap": overlap_of(job.pair)}
+    try:
+        pair = with_depth_of(job.pair, job.depth, job.seed)
+    except GarpsError as error:  # of this pair: networks that cannot run at all are left out beforehand
+        reason = f"no depth: {error}"
+        rows = [failed_pair(job.config, job.pair, start, job.methods, reason) for start in job.starts]
+        return [[same | row for row in of_start] for of_start in rows]
+    if job.depth != SENSOR:
+        same["depth_errors"] = errors_of_pair(pair, job.pair)
     made: list[list[Row]] = []
     shared: dict[str, Row] = {}
     for start in job.starts:
@@ -144,17 +154,18 @@ def main(
         known = reusable_rows(reuse_peers, seed) if reuse_peers else {}
         of_config = {name: config.settings() for name, config in configs.items()}
         options = {"plan": plan, "methods": chosen, "limit": limit, "half": half, "seed": seed}
-        log = RowLog(out, options | {"settings": of_config, "reuse_peers": str(reuse_peers or "")}, resume)
+        options |= {"settings": of_config, "reuse_peers": str(reuse_peers or "")}
         pairs, jobs, left_out = _planned(plan, configs, chosen, limit, half, workers, seed, console)
-        missing = [_lent(job, known) for job in jobs if not log.done.issuperset(job.keys)]
-        _run(missing, log, workers, scheduler, console)
+        log = RowLog(out, options, resume)  # last: it begins the file anew
+        missing = [_lent(_rest_of(job, log), known) for job in jobs]
+        _run([job for job in missing if job.starts], log, workers, scheduler, console)
     except (OSError, ValueError, GarpsError) as error:
-        console.print(str(error), soft_wrap=True)
+        console.print(str(error), soft_wrap=True, markup=False)
         raise typer.Exit(2) from None
-    facts: Row = {"seed": seed, **machine_facts()} | {"settings": of_config, "data": sources}
+    facts: Row = {"seed": seed, **machine_facts()} | {"settings": of_config, "data": [_shown(s) for s in sources]}
     if reuse_peers:
         facts["reused_peers"] = reuse_note(log.rows, reuse_peers)
-    write_report(out, log.rows, facts, pairs, left_out, console)
+    write_report(out, log.rows, facts, pairs, configs, left_out, console)
 
 
 def _names() -> list[str]:
@@ -167,8 +178,8 @@ def _asked(source: str, depth: str, starts: str) -> tuple[tuple[str, ...], tuple
     """Depths and starts of a source: those that were asked for, else its own."""
     depths, its_starts = defaults_of(source)
     return (
-        tuple(_known("depth", depth.split(","), tuple(DEPTHS))) if depth else depths,
-        tuple(_known("start", starts.split(","), STARTS)) if starts else its_starts,
+        tuple(dict.fromkeys(_known("depth", depth.split(","), tuple(DEPTHS)))) if depth else depths,
+        tuple(dict.fromkeys(_known("start", starts.split(","), STARTS))) if starts else its_starts,
     )
 
 
@@ -182,18 +193,40 @@ def _planned(
     seed: int,
     console: Console,
 ) -> tuple[list[Pair], list[Job], list[str]]:
-    """All pairs, the jobs in the order of the tables, and what cannot be run, in words (printed too)."""
-    pairs, jobs, left_out = [], [], []
+    """All pairs, the jobs in the order of the tables, and what cannot be run, in words (printed too).
+
+    Raises:
+        ValueError: two pairs of one set and name, or nothing that can be run.
+    """
+    pairs, jobs = [], []
+    missing = {depth: reason for depth in configs if (reason := why_not(depth))}
+    left_out = [f"depth {depth}: {reason}" for depth, reason in missing.items()]
     for source, depths, starts in plan:
         found = pairs_of(source, limit, workers, console, half)
         pairs += found
-        for depth in depths:
+        for depth in (depth for depth in depths if depth not in missing):
             having = [pair for pair in found if usable(pair, depth)]
             jobs += [Job(depth, starts, pair, configs[depth], tuple(methods), seed) for pair in having]
             left_out += without_depth(found, depth)
     for text in left_out:
-        console.print(f"left out: {text}", soft_wrap=True)
+        console.print(f"left out: {text}", soft_wrap=True, markup=False)
+    if twice := [name for name, n in Counter((pair.set, pair.id) for pair in pairs).items() if n > 1]:
+        raise ValueError(
+            f"{len(twice)} pairs are there twice, as {' '.join(twice[0])}: give each set once, by one name"
+        )
+    if not jobs:
+        raise ValueError("nothing to run: no set has pairs with the depth that was asked for")
     return pairs, jobs, left_out
+
+
+def _rest_of(job: Job, log: RowLog) -> Job:
+    return replace(job, starts=tuple(key[2] for key in job.keys if key not in log.done))
+
+
+def _shown(source: str) -> str:
+    """NAME=FOLDER with the folder seen from here: what is written names no place of this machine."""
+    name, folder = named(source)
+    return f"{name}={os.path.relpath(folder)}"
 
 
 def _lent(job: Job, known: Mapping[Key, Mapping[str, Row]]) -> Job:
@@ -203,8 +236,9 @@ def _lent(job: Job, known: Mapping[Key, Mapping[str, Row]]) -> Job:
 def _run(jobs: Sequence[Job], log: RowLog, workers: int, scheduler: str, console: Console) -> None:
     if not jobs:
         return
-    first = with_depth_of(jobs[0].pair, jobs[0].depth)
-    run_garps(jobs[0].config, first, "disturbed", disturbed_prior(first))  # compiles, once for all processes
+    with contextlib.suppress(GarpsError):  # compiles, once for all processes
+        first = with_depth_of(jobs[0].pair, jobs[0].depth)
+        run_garps(jobs[0].config, first, "disturbed", disturbed_prior(first))
     with Progress(console=console) as bars:
         for made in bars.track(computed(rows_of, jobs, workers, scheduler), len(jobs), description="pairs"):
             log.add([row for rows in made for row in rows])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from bench.baselines import METHODS, NEED_NO_START
 from bench.tables import ERRORS, Row
 
-ROWS = "rows.jsonl"
+ROWS, PREVIOUS = "rows.jsonl", "rows.previous.jsonl"
 Key = tuple[str, str, str, str]
 """Depth, set, start, pair."""
 
@@ -28,7 +29,7 @@ class RowLog:
     Args:
         folder: of the run; the file in it is `ROWS`.
         options: everything that decides about the rows, but for the code itself.
-        resume: go on with the rows that are there; False starts anew.
+        resume: go on with the rows that are there; False starts anew, and keeps those that were there as `PREVIOUS`.
     Raises:
         ValueError: to be resumed, and there is nothing, or it was made with other options.
     """
@@ -40,14 +41,16 @@ class RowLog:
         if resume:
             self.rows = self._read(given)
         folder.mkdir(parents=True, exist_ok=True)
-        with self.path.open("w") as file:  # without the line that an interruption tore
-            file.write(json.dumps(given) + "\n")
-        groups: dict[Key, list[Row]] = {}
+        groups: dict[tuple[str, str, str], list[Row]] = {}
         for row in self.rows:
-            groups.setdefault(key_of(row), []).append(row)
-        for group in groups.values():
-            self._append(group)
-        self.done = set(groups)
+            groups.setdefault((row["depth"], row["set"], row["pair"]), []).append(row)
+        lines = [json.dumps(part) for part in (given, *groups.values())]  # without the line that an interruption tore
+        if self.path.is_file() and not resume:
+            self.path.replace(self.path.with_name(PREVIOUS))
+        unfinished = self.path.with_suffix(".unfinished")
+        unfinished.write_text("\n".join(lines) + "\n")
+        unfinished.replace(self.path)
+        self.done = {key_of(row) for row in self.rows}
 
     def add(self, rows: Sequence[Row]) -> None:
         """The rows of one pair."""
@@ -107,8 +110,8 @@ def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
         raise ValueError(f"{path} was made with seed {earlier_seed}, not {seed}: its starts and depth differ")
     found: dict[Key, dict[str, Row]] = {}
     for row in rows:
-        if "depth" not in row:
-            raise ValueError(f"{path} has rows without depth: it was made by an earlier version; run its peers anew")
+        if not {"depth", "e_c_m"} <= row.keys():
+            raise ValueError(f"{path} has rows without depth or e_c_m: an earlier version made it; run its peers anew")
         method = row["method"]
         if method in METHODS and (row["start"] != "features" or method in NEED_NO_START):
             found.setdefault(key_of(row), {})[method] = {"reused": commit} | _with_infinities(row)
@@ -124,5 +127,5 @@ def reuse_note(rows: Sequence[Row], path: Path) -> str:
     """How many rows of peers come from an earlier run, in words."""
     peers = [row for row in rows if row["method"] in METHODS]
     commits = [row["reused"] for row in peers if "reused" in row]
-    origin = f"{path} (commit {', '.join(dict.fromkeys(commits)) or 'none'})"
+    origin = f"{os.path.relpath(path)} (commit {', '.join(dict.fromkeys(commits)) or 'none'})"
     return f"{len(commits)} of {len(peers)} rows of peers, times included, were not run anew but taken from {origin}."

@@ -31,17 +31,42 @@ from garps_core.reconstruct import with_depth
 
 NETWORKS = tuple(name for name in DEPTHS if name not in (SENSOR, MONOCULAR))
 MAX_MM = 65535
+MADE_BY = "made_by.txt"
 
 
-def frames_without_depth(folder: Path, split: str) -> list[tuple[str, re10k.Camera]]:
-    """Clip and first camera of every track whose first frame is there and has no depth map."""
+def frames_without_depth(folder: Path, split: str, skipped: list[str] | None) -> list[tuple[str, re10k.Camera]]:
+    """Clip and first camera of every track that is long enough and whose first frame is there and has no depth map.
+
+    Raises:
+        ValueError: a malformed track, unless there is a list to name it in.
+    """
     found = []
     for track in sorted((folder / "cameras" / re10k.SPLITS[split][0]).glob("*.txt")):
-        camera = re10k.read_track(track)[re10k.FIRST]
-        there = re10k.frame_file(folder, track.stem, camera).is_file()
-        if there and not re10k.depth_file(folder, track.stem, camera).is_file():
-            found.append((track.stem, camera))
+        try:
+            cameras = re10k.read_track(track)
+        except ValueError:
+            if skipped is None:
+                raise
+            continue  # `sample` names it
+        there = len(cameras) > re10k.LAST and re10k.frame_file(folder, track.stem, cameras[re10k.FIRST]).is_file()
+        if there and not re10k.depth_file(folder, track.stem, cameras[re10k.FIRST]).is_file():
+            found.append((track.stem, cameras[re10k.FIRST]))
     return found
+
+
+def claim_depth(folder: Path, network: str) -> None:
+    """Note whose depth maps the folder holds. Raises ValueError where it holds others: metres must have one origin."""
+    note = folder / "depth" / MADE_BY
+    if note.is_file() and note.read_text().strip() == network:
+        return
+    if any((folder / "depth").glob("*/*.png")):
+        whose = note.read_text().strip() if note.is_file() else "somebody else's"
+        raise ValueError(
+            f"{folder / 'depth'} holds depth maps ({whose}), not of {network}: remove them, or take them as they are "
+            f"with --scale {SOURCE}"
+        )
+    note.parent.mkdir(parents=True, exist_ok=True)
+    note.write_text(f"{network}\n")
 
 
 def make_depth(folder: Path, clip: str, camera: re10k.Camera, network: str) -> None:
@@ -69,23 +94,26 @@ def main(
 ) -> None:
     """Choose pairs of RealEstate10K."""
     console = Console(soft_wrap=True)
-    skipped: list[str] = []
+    left_out: list[str] = []
+    skipped = left_out if skip else None
     try:
         path = folder / re10k.list_file(split)
+        if path.exists():
+            raise ValueError(f"{path} exists: a list is written once; remove it to choose anew")
         if depth:
             if depth not in NETWORKS or scale not in (RAW, SOURCE):
                 raise ValueError(f"--depth is {depth!r}, --scale {scale!r}: expected one of {', '.join(NETWORKS)}")
             scale = f"{SOURCE}:{depth}"
+            claim_depth(folder, depth)
             with Progress(console=console) as bars:
-                for clip, camera in bars.track(frames_without_depth(folder, split), description="depth"):
+                for clip, camera in bars.track(frames_without_depth(folder, split, skipped), description="depth"):
                     make_depth(folder, clip, camera, depth)
-        options = {"split": split, "scale": scale, "seed": seed, "each": each}
-        records = re10k.sample(folder, **options, skipped=skipped if skip else None)
+        records = re10k.sample(folder, split=split, scale=scale, seed=seed, each=each, skipped=skipped)
     except (OSError, ValueError, GarpsError) as error:
-        console.print(str(error))
+        console.print(str(error), markup=False)
         raise typer.Exit(2) from None
-    for text in skipped:
-        console.print(f"left out: {text}")
+    for text in left_out:
+        console.print(f"left out: {text}", markup=False)
     counts = {name: sum(record.category == name for record in records) for name in ("small", "large")}
     console.print(f"{path}: {counts['small']} small, {counts['large']} large, scale {scale}, seed {seed}")
 

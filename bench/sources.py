@@ -14,7 +14,9 @@ from rich.console import Console
 from bench import bare, learned_rooms
 from bench.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread, with_monocular_depth
 from bench.readers import READERS, load
-from garps_core import Config
+from bench.readers.pair_list import RAW
+from garps_core import Config, GarpsError
+from garps_core.models.loaded import depth_network_of
 from garps_core.reconstruct import with_depth
 
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
@@ -102,7 +104,9 @@ def config_of(depth: str) -> Config:
 
 
 def with_depth_of(pair: Pair, depth: str, seed: int = 0) -> Pair:
-    """The pair with a depth of `DEPTHS`; where no true points are known, E_3D is of those that this depth gives.
+    """The pair with a depth of `DEPTHS`.
+
+    Where no true points are known, E_3D is of those that this depth gives the source, unless the truth has no metres.
 
     Raises:
         WeightsError: the network's weights are not installed.
@@ -113,8 +117,21 @@ def with_depth_of(pair: Pair, depth: str, seed: int = 0) -> Pair:
         return with_monocular_depth(pair, seed)
     config = Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth})
     source, target = with_depth([pair.source, pair.target], config)
-    points = pair.points if len(pair.points) else scene_points(source)
-    return replace(pair, source=source, target=target, points=points)
+    pair = replace(pair, source=source, target=target)
+    if len(pair.points) or pair.scale == RAW:  # metres and the set's own unit do not mix
+        return pair
+    return replace(pair, points=scene_points(source), points_from=depth)
+
+
+def why_not(depth: str) -> str:
+    """Why a network of `DEPTHS` cannot run here, or nothing."""
+    if depth in (SENSOR, MONOCULAR):
+        return ""
+    try:
+        depth_network_of(Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth}).reconstruction)
+    except GarpsError as error:
+        return str(error)
+    return ""
 
 
 def overlap_of(pair: Pair) -> float | None:

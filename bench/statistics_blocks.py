@@ -3,8 +3,8 @@
 
 Rows are those of `bench.evaluate`, one per depth, set, start, pair and method. A mean or a spread exists over poses
 only, and flatters methods that fail on hard pairs; a median and an AUC exist over all pairs with failures at infinity;
-over the common subset methods may be compared by their means. Each comes with its n. Errors that are not defined for a
-pose (NaN: E_3D of a pair without points, the direction of no motion) are left out, and n says so.
+over the common subset methods may be compared by their means. Each comes with its n. Pairs for which the truth defines
+no such error (E_3D without points, the direction of no motion) are left out, for every method alike.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.scores import INF, NAN, auc, mean_average_accuracy, pose_error_deg
-from bench.tables import Row
+from bench.scores import NAN, auc, mean_average_accuracy, pose_error_deg
+from bench.tables import Row, error_of
 from garps_core.checks import Float64Array
 
 DDOF = 1
@@ -75,13 +75,8 @@ def length_unit(rows: Iterable[Row]) -> str:
 
 
 def errors_of(rows: Iterable[Row], name: str) -> Float64Array:
-    """An error of every row: infinity for a failure, NaN where it is not defined or not there."""
-    return np.array([_value(row, name) if row["found"] else INF for row in rows], np.float64)
-
-
-def _value(row: Row, name: str) -> float:
-    value = row.get(name)
-    return NAN if value is None else float(value)
+    """`tables.error_of` of every row: infinity for a failure, NaN where it is not defined or not there."""
+    return np.array([error_of(row, name) for row in rows], np.float64)
 
 
 def spread(values: npt.ArrayLike) -> Spread:

@@ -21,9 +21,12 @@ from rich.table import Table
 from scipy.stats import rankdata
 
 from garps_core import metrics
+from garps_core.checks import Float64Array
 
 Row = dict[str, Any]
 GARPS = "garps"
+START = "(start)"
+"""The row of the pose before the alignment."""
 ERRORS = ("e_trans_m", "e_rot_deg", "e_3d_m", "e_c_m", "vcre_px")
 """What is infinite where there is no pose."""
 SUCCESS_M, SUCCESS_DEG = 0.05, 2.0
@@ -86,9 +89,9 @@ def _statistics(rows: Sequence[Row]) -> Row:
     found = [row for row in rows if row["found"]]
     good = [is_right(row) for row in rows]
     line: Row = {"n": f"{len(found)}/{len(rows)}"}
-    line |= {name: float(np.median([row[name] for row in rows])) for name in ("e_trans_m", "e_rot_deg", "e_3d_m")}
+    line |= {name: float(np.median(_defined(rows, name))) for name in ("e_trans_m", "e_rot_deg", "e_3d_m")}
     # "higher" takes a value that is there: between two infinite ones there is nothing to interpolate.
-    line["p90_e_3d_m"] = float(np.quantile([row["e_3d_m"] for row in rows], 0.9, method="higher"))
+    line["p90_e_3d_m"] = float(np.quantile(_defined(rows, "e_3d_m"), 0.9, method="higher"))
     line["mean_e_trans_m"] = float(np.mean([row["e_trans_m"] for row in found])) if found else float("nan")
     line["success"] = float(np.mean(good))
     line["map_free"] = float(np.mean([is_right(row, MAP_FREE_M, MAP_FREE_DEG) for row in rows]))
@@ -100,6 +103,29 @@ def _statistics(rows: Sequence[Row]) -> Row:
         line["wrong_ok"] = float(np.mean(wrong))
     line["statuses"] = ", ".join(f"{state} {states.count(state)}" for state in dict.fromkeys(states))
     return line
+
+
+def error_of(row: Row, name: str) -> float:
+    """An error of a row: infinity for a failure, NaN where the truth defines none, whatever the method.
+
+    Without a true translation there is no error of direction, without points (`points` of the row) no E_3D. An estimate
+    of zero where there is a translation names no direction, and is a failure to.
+    """
+    undefined = {"e_dir_deg": row.get("true_trans_m") == 0, "e_3d_m": row.get("points") == 0}
+    value = row.get(name)
+    if undefined.get(name, False):
+        return float("nan")
+    if not row["found"]:
+        return float("inf")
+    if name == "e_dir_deg" and value is not None and np.isnan(value) and row.get("true_trans_m"):
+        return float("inf")
+    return float("nan") if value is None else float(value)
+
+
+def _defined(rows: Sequence[Row], name: str) -> Float64Array:
+    """Of the rows for which the truth defines the error; a NaN where it does for none."""
+    values = np.array([error_of(row, name) for row in rows])
+    return values[~np.isnan(values)] if not np.isnan(values).all() else np.full(1, np.nan)
 
 
 def coverage(rows: Sequence[Row]) -> tuple[float, int]:
@@ -155,6 +181,13 @@ def sections(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row], list[str]]]:
                 below.append(confidence_line(part, f"{depth} depth, {name}, all starts"))
             if following[0] != depth or following[1] == "":
                 below.append(confidence_line(pooled, f"{depth} depth, all sets and starts"))
+        scales = {str(row.get("scale", "metres")).partition(" x")[0] for row in rows if _table_of(row) == key} - {
+            "metres"
+        }
+        if scales:
+            below.insert(
+                0, f"Lengths are in the truth's own unit, not in measured metres: {', '.join(sorted(scales))}."
+            )
         title = f"{depth} depth, {name}, start: {start}"
         yield title, [line for line in lines if _table_of(line) == key], below
 

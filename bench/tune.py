@@ -50,8 +50,8 @@ from bench.sources import (
     usable,
     with_depth_of,
 )
-from bench.tables import GARPS, Row
-from garps_core import Config
+from bench.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
+from garps_core import Config, GarpsError
 from garps_core.metrics import CHI2_6_95
 from garps_core.settings import write_settings
 
@@ -96,7 +96,7 @@ def loss_of(tables: Sequence[Sequence[Row]]) -> float:
 
 def _table_loss(rows: Sequence[Row]) -> float:
     errors = np.clip([row["e_3d_m"] for row in rows], SMALLEST_M, LARGEST_M)
-    failed = np.mean([row["e_trans_m"] >= 0.25 or row["e_rot_deg"] >= 5 for row in rows])
+    failed = np.mean([not is_right(row, MAP_FREE_M, MAP_FREE_DEG) for row in rows])
     return float(np.log10(np.median(errors)) + np.log10(np.percentile(errors, 90)) + failed)
 
 
@@ -128,7 +128,7 @@ def search(study: optuna.Study, planned: Sequence[Part], trials: int, console: C
     """Run so many trials more; the first of a study is the preset as it is."""
     depth = planned[0].depth
     preset = config_of(depth)
-    if not study.trials:
+    if not _completed(study):
         study.enqueue_trial({name: preset.settings()[name] for name in SPACES[depth]})
 
     def objective(trial: optuna.Trial) -> float:
@@ -173,7 +173,7 @@ def planned_parts(depth: str, sources: Sequence[str], limit: int | None) -> list
     """The tables that decide about a depth.
 
     Raises:
-        ValueError: no such depth, or none of the sources is of a kind that decides about it.
+        ValueError: no such depth, none of the sources is of a kind that decides about it, or one has too few pairs.
     """
     if depth not in SPACES:
         raise ValueError(f"depth is {depth!r}: expected one of {', '.join(SPACES)}")
@@ -181,6 +181,9 @@ def planned_parts(depth: str, sources: Sequence[str], limit: int | None) -> list
     if not chosen:
         kinds = ", ".join(f"{name}=FOLDER" for name in TUNED_ON[depth])
         raise ValueError(f"no data to tune {depth} on: give --data {kinds}")
+    for source in chosen:
+        if not all(_pairs(depth, source, half, limit) for half in ("dev", "held-out")):
+            raise ValueError(f"{source} has no pair with {depth} depth in one of its halves: expected at least 2 pairs")
     return [Part(depth, source, start, "dev", limit) for source in chosen for start in defaults_of(source)[1]]
 
 
@@ -195,12 +198,12 @@ def main(
     console = Console(width=None if sys.stdout.isatty() else 160)
     try:
         planned = planned_parts(depth, data or sources_there(), limit)
-        for part in planned:
-            _pairs(part.depth, part.source, part.half, part.limit)
-    except (OSError, ValueError) as error:
-        console.print(str(error), soft_wrap=True)
+        study = _study(out, planned)
+        if not trials and not _completed(study):
+            raise ValueError(f"{out} has no finished trial of {depth}: there is nothing to report; give --trials")
+    except (OSError, ValueError, GarpsError) as error:
+        console.print(str(error), soft_wrap=True, markup=False)
         raise typer.Exit(2) from None
-    study = _study(out, depth)
     if trials:
         search(study, planned, trials, console)
     console.print(f"{len(study.trials)} trials, best {study.best_value:.3f}:")
@@ -213,8 +216,17 @@ def main(
     console.print(report(study, planned, console))
 
 
-def _study(out: Path, depth: str) -> optuna.Study:
-    """The study of a depth in a folder, begun unless it is there; seeded by how many trials it has."""
+def _completed(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+
+
+def _study(out: Path, planned: Sequence[Part]) -> optuna.Study:
+    """The study of a depth in a folder, begun unless it is there; seeded by how many trials it has.
+
+    Raises:
+        ValueError: the study that is there is of other pairs, or searched something else: losses do not compare.
+    """
+    depth = planned[0].depth
     out.mkdir(parents=True, exist_ok=True)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = f"sqlite:///{out}/study.db"
@@ -222,6 +234,10 @@ def _study(out: Path, depth: str) -> optuna.Study:
     study = optuna.create_study(storage=storage, study_name=depth, pruner=pruner, load_if_exists=True)
     sampler: Any = optuna.samplers.TPESampler(seed=len(study.trials), multivariate=True)
     study.sampler = sampler
+    made_of = {"tables": [list(part) for part in planned], "searched": sorted(SPACES[depth])}
+    if study.user_attrs.get("made_of", made_of) != made_of:
+        raise ValueError(f"the study of {depth} in {out} is of other pairs or settings: give another --out")
+    study.set_user_attr("made_of", made_of)
     return study
 
 

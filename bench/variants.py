@@ -30,13 +30,15 @@ VAGUE = 1e4
 
 @dataclass(frozen=True)
 class Variant:
-    """What is changed: settings, by name or from those there are; the mixtures; whether the start is believed."""
+    """What is changed: settings, by name or from those there are; the mixtures; whether the start is believed, and is
+    that of GARPS as it is, although settings that it depends on are changed."""
 
     what: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     settings: Callable[[Config], Config] = lambda config: config
     mixture: Callable[[Mixture], Mixture] = lambda mixture: mixture
     believes_start: bool = True
+    same_start: bool = False
     labels: bool = False
 
     def config(self, config: Config) -> Config:
@@ -64,8 +66,9 @@ def last_rung(config: Config) -> Config:
 
 
 def as_published(config: Config) -> Config:
-    """The paper's own settings for lifting and alignment, on the depth and from the start that there are."""
-    return replace(Config.preset("paper"), reconstruction=config.reconstruction, start=config.start)
+    """The paper's own settings for lifting and alignment."""
+    paper = Config.preset("paper")
+    return replace(config, lifting=paper.lifting, alignment=paper.alignment)
 
 
 VARIANTS: dict[str, Variant] = {
@@ -84,7 +87,7 @@ VARIANTS: dict[str, Variant] = {
     "garps-no-ray-uncertainty": Variant(
         "depth without noise", {"lifting.noise_floor_m": 5e-4, "lifting.noise_linear": 0.0}
     ),
-    GARPS_PAPER: Variant("the paper's settings, from the same start", settings=as_published),
+    GARPS_PAPER: Variant("the paper's settings, from the same start", settings=as_published, same_start=True),
     "garps-no-depth-errors": Variant("depth maps' own errors are not solved for", {"alignment.depth_errors": False}),
 }
 """By the name that stands in tables."""
@@ -92,13 +95,15 @@ VARIANTS: dict[str, Variant] = {
 
 def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) -> PoseEstimate:
     """The estimate of a variant from a given pose, or from whatever the settings start with. Never raises on data."""
-    config = variant.config(config)
+    of_start, config = config, variant.config(config)
+    if not variant.same_start:
+        of_start = config
     try:
         views = with_depth([pair.source, pair.target], config)
         x, y = (variant.mixture(mixture) for mixture in mixtures_of(views, config))
         if variant.labels and pair.labels is not None:
             x, y = (labelled(m, seen, v.K) for m, seen, v in zip((x, y), pair.labels, views, strict=True))
-        starts = initialise(views[0], views[1], config, prior)
+        starts = initialise(views[0], views[1], of_start, prior)
         if not variant.believes_start:
             starts = tuple(replace(start, covariance=VAGUE * start.covariance) for start in starts)
         return best_of(x, y, starts, config)

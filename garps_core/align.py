@@ -23,7 +23,7 @@ from garps_core.search import search
 from garps_core.solve import MIN_ROWS, Belief, Solution
 from garps_core.systematic import DEPTH_MODES, shared_sigmas
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.uncertainty import inflated_beyond, pose_covariance, ros_from_twist, twist_from_ros
+from garps_core.uncertainty import inflated, pose_covariance, ros_from_twist, share_of_known, twist_from_ros
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0
@@ -234,16 +234,15 @@ def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
 def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool, config: Config) -> Finding:
     """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
-    covariance = pose_covariance(solution, known, config.lifting)
+    covariance, of_known = pose_covariance(solution, known, config.lifting), share_of_known(solution, known)
     seen = None
     if x.frustum is not None and y.frustum is not None:
         prior = twist_from_ros(covariance, T) * (SEARCHED_SIGMAS**2 if guess else 1.0)
         seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
     if seen is not None and settings.brightness > 0:
         T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)
-    if config.lifting.sigma_inflation > 1:
-        of_twist = inflated_beyond(twist_from_ros(covariance, T), known.precision, config.lifting.sigma_inflation)
-        covariance = ros_from_twist(of_twist, T)
+        of_known = seen.kept @ of_known @ seen.kept.T
+    covariance = inflated(covariance, ros_from_twist(of_known, T), config.lifting.sigma_inflation)
     common = config.lifting.common_scale_sigma
     if config.reconstruction.method == "two_view":
         common = config.start.network_scale_sigma

@@ -13,7 +13,7 @@ biweight. (Direct alignment as in Steinbruecker et al. 2011 and Kerl et al. 2013
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import cv2
@@ -52,6 +52,8 @@ class Sharpened:
     """Of the brightness of points and of the pixels they fall on, -1..1, the smaller of both directions."""
     share: float
     """Share (0..1) of the points that the other camera sees, the smaller of both directions."""
+    kept: Array = field(default_factory=lambda: np.eye(6))
+    """(6, 6) what is left of an error of the prior: the left twist it becomes in T."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def sharpen(
         effect = held @ (weight * pull) * sigmas
         spread += effect @ effect.T
     agreement = min(f.correlation, b.correlation), min(f.share, b.share)
-    return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement)
+    return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(held @ precision))
 
 
 def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:

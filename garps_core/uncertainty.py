@@ -72,24 +72,30 @@ def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Arra
     return ros_from_twist(0.5 * (of_pose + of_pose.T), solution.T)
 
 
-def inflated_beyond(covariance: Array, known: Array, factor: float) -> Array:
+def share_of_known(solution: Solution, known: Belief) -> Array:
+    """6x6 part of the covariance of the solution's left twist that comes from what was known of the pose: C K C.
+
+    C = (D + K)^-1 without the shared errors that `pose_covariance` adds: they come from the data.
+    """
+    joint = solution.weight * curvature(solution.data, OPEN_DIRECTION, OPEN_BELOW) + known.joint()
+    C = np.linalg.inv(joint)[:6, :6]
+    return np.asarray(C @ known.precision @ C)
+
+
+def inflated(covariance: Array, of_known: Array, factor: float) -> Array:
     """Covariance of an estimate whose data are noisier than it took them for, while what was known is as it said.
 
-    With sigmas `factor` times as large the data's information counts for less, but the estimate had weighted them as
-    if they were good: C' = C (f^2 D + K) C with D = C^-1 - K, which is C + (f^2 - 1) (C - C K C).
+    With sigmas `factor` times as large the data count for less, but the estimate had weighted them as if they were
+    good: C' = C (f^2 D + K) C = f^2 C - (f^2 - 1) C K C, of what the data say alone f^2.
 
     Args:
-        covariance: 6x6 C of the left twist, as computed.
-        known: 6x6 precision K of the left twist that the estimate began with.
+        covariance: 6x6 as computed.
+        of_known: 6x6 part of it that comes from what was known, C K C.
         factor: f, at least 1.
     Returns:
-        6x6, nowhere less than C.
+        6x6, nowhere less than the covariance.
     """
-    if factor == 1:
-        return covariance
-    of_data = covariance - covariance @ known @ covariance
-    sizes, axes = np.linalg.eigh(0.5 * (of_data + of_data.T))
-    return np.asarray(covariance + (factor**2 - 1) * (axes * np.maximum(sizes, 0.0)) @ axes.T)
+    return np.asarray(covariance + (factor**2 - 1) * (covariance - of_known))
 
 
 def shared_pull(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:

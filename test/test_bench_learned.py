@@ -11,7 +11,7 @@ pytest.importorskip("embreex")
 from bench.acceptance import Bar, bars, differences
 from bench.datasets import Pair
 from bench.depth_data import FIRST_SEED
-from bench.depth_errors import depth_errors, depth_table
+from bench.depth_errors import depth_errors, depth_tables, errors_of_pair
 from bench.learned_rooms import KINDS, SPLITS, kind_of, level_of
 from bench.rooms import LEVELS
 from bench.train_depth import HELD_OUT_SEED
@@ -78,12 +78,23 @@ def test_the_bars_tell_sure_from_unsure() -> None:
 def test_the_table_tells_common_from_own_scale() -> None:
     """Two maps of a pair that are off by the same factor, another from pair to pair."""
     view = View(np.zeros((16, 16, 3), np.uint8), np.diag([50.0, 50.0, 1.0]), np.full((16, 16), 2.0, np.float32))
-    pairs = [Pair("rooms", f"p{i}", "rich", view, view, np.eye(4), np.zeros((0, 3))) for i in range(40)]
-    factors = iter(np.exp(np.random.default_rng(0).normal(0, 0.1, 40)).astype(np.float32))
-
-    def off_by_one_factor(pair: Pair) -> Pair:
-        off = replace(view, depth=view.depth * next(factors))
-        return replace(pair, source=off, target=off)
-
-    cells = depth_table(pairs, off_by_one_factor).splitlines()[-1].split("|")
+    true = Pair("rooms", "p", "rich", view, view, np.eye(4), np.zeros((0, 3)))
+    rows = []
+    for i, factor in enumerate(np.exp(np.random.default_rng(0).normal(0, 0.1, 40)).astype(np.float32)):
+        off = replace(view, depth=view.depth * factor)
+        found = errors_of_pair(replace(true, source=off, target=off), true)
+        rows += [row(f"p{i}", start, "garps", 0.1) | {"depth_errors": found} for start in ("none", "disturbed")]
+    text = depth_tables([*rows, row("p0", "none", "garps", 0.1) | {"set": "other", "depth_errors": None}])
+    assert text.count("**Errors of") == 1 and "| all | 80 |" in text
+    cells = next(line for line in text.splitlines() if line.startswith("| all")).split("|")
     assert float(cells[7]) == pytest.approx(0.1, abs=0.03) and float(cells[8]) == 0
+
+
+def test_a_map_without_readings_has_no_errors() -> None:
+    view = View(np.zeros((16, 16, 3), np.uint8), np.diag([50.0, 50.0, 1.0]), np.full((16, 16), 2.0, np.float32))
+    pair = Pair("rooms", "p", "rich", view, view, np.eye(4), np.zeros((0, 3)))
+    halves = np.full((2, 16, 16), 2.0, np.float32)
+    halves[0, :8], halves[1, 8:] = np.nan, np.nan
+    found, true = (replace(pair, target=replace(view, depth=half)) for half in halves)
+    assert errors_of_pair(found, true) is None and errors_of_pair(pair, pair) is not None
+    assert errors_of_pair(pair, replace(pair, source=replace(view, depth=None))) is None

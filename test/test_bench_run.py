@@ -2,6 +2,7 @@
 """The evaluation bench on two small pairs in the pairs.json layout: every method, twice the same, stopped, resumed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,8 +16,9 @@ pytest.importorskip("embreex")
 
 from bench import repeat, run, sources
 from bench.baselines import METHODS
+from bench.datasets import read_pairs
 from bench.rooms import make_pair
-from garps_core import Config
+from garps_core import Config, View
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TIMES = ("seconds",)
@@ -135,6 +137,37 @@ def test_mistakes_are_one_line(words: list[str], message: str, tmp_path: Path) -
     assert code == 2 and message in printed and "Traceback" not in printed
 
 
+def test_a_mistake_costs_no_rows(folder: Path, tmp_path: Path) -> None:
+    """Neither one that is noticed late, nor a run over one that is there."""
+    words = ["--data", f"pairs={folder}", "--depth", "sensor,sensor", "--starts", "features,features"]
+    words += ["--methods", "sift-pnp", "--workers", "1", "--out", str(tmp_path)]
+    assert called(*words)[0] == 0
+    rows = (tmp_path / "rows.jsonl").read_text()
+    assert len(rows.splitlines()) == 3 and len(rows_in(tmp_path)) == 4, "each once, although named twice"
+    for wrong in (["--half", "third"], ["--data", "pairs=[/nowhere]"], ["--data", f"pairs={folder}"]):
+        code, printed = called(*words, *wrong)
+        assert code == 2 and "Traceback" not in printed
+        assert (tmp_path / "rows.jsonl").read_text() == rows
+    assert "2 pairs are there twice" in printed or "3 pairs are there twice" in printed
+    assert called(*words, "--seed", "1")[0] == 0
+    assert (tmp_path / "rows.previous.jsonl").read_text() == rows
+
+
+def test_only_missing_starts_are_run_again(folder: Path, tmp_path: Path) -> None:
+    words = ["--data", f"pairs={folder}", "--depth", "sensor", "--starts", "features,identity", "--methods", "sift-pnp"]
+    words += ["--workers", "1", "--out", str(tmp_path)]
+    assert called(*words)[0] == 0
+    whole = rows_in(tmp_path)
+    lines = (tmp_path / "rows.jsonl").read_text().splitlines()
+    half = json.dumps([row for row in json.loads(lines[1]) if row["start"] == "features"])
+    (tmp_path / "rows.jsonl").write_text("\n".join([lines[0], half, lines[2]]) + "\n")
+    assert called(*words, "--resume")[0] == 0
+    key = ("pair", "start", "method")
+    assert sorted(rows_in(tmp_path), key=lambda row: [row[k] for k in key]) == sorted(
+        whole, key=lambda row: [row[k] for k in key]
+    )
+
+
 def test_the_names_are_listed() -> None:
     code, printed = called("--list")
     assert code == 0 and "garps-isotropic: balls of the same volume" in printed and "peers: all of" in printed
@@ -145,6 +178,27 @@ def test_depth_of_a_network_needs_its_weights(folder: Path, tmp_path: Path, monk
     words = ["--data", f"pairs={folder}", "--depth", "depth_anything_v2", "--out", str(tmp_path / "out")]
     code, printed = called(*words)
     assert code == 2 and "no depth_anything weights in" in printed
+
+
+def test_a_network_that_is_not_there_leaves_the_others_alone(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
+    words = ["--data", f"pairs={folder}", "--depth", "depth_anything_v2,sensor", "--starts", "features", "--methods"]
+    code, printed = called(*words, "garps", "--workers", "1", "--out", tmp_path / "out")
+    assert code == 0 and "left out: depth depth_anything_v2: no depth_anything weights in" in printed, printed
+    assert {row["depth"] for row in rows_in(tmp_path / "out")} == {"sensor"}
+    assert "- depth depth_anything_v2: no depth_anything weights" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_a_pair_without_depth_is_failures(folder: Path) -> None:
+    """A picture that the network cannot take: far too narrow."""
+    pair = read_pairs("rooms", folder, 1)[0]
+    narrow = View(np.zeros((480, 32, 3), np.uint8), pair.source.K)
+    job = run.Job("demo_net", ("none", "features"), replace(pair, source=narrow), Config(), ("garps", "sift-pnp"), 0)
+    made = run.rows_of(job)
+    assert [[row["method"] for row in rows] for rows in made] == [["(start)", "garps", "sift-pnp"]] * 2
+    assert all(not row["found"] and row["reason"].startswith("no depth: ") for rows in made for row in rows)
 
 
 def test_what_is_run_by_default(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ def made_row(method, e_3d=0.01, *, depth="sensor", set="hololens_lounge", start=
     found = np.isfinite(e_3d)
     row = {"depth": depth, "set": set, "pair": pair, "category": "small", "start": start, "method": method}
     row |= {"found": bool(found), "seconds": 0.1, "reason": "", "e_trans_m": e_3d, "e_3d_m": e_3d}
-    return row | {"e_rot_deg": 10 * e_3d if found else INF} | more
+    return row | {"e_rot_deg": 10 * e_3d if found else INF, "e_c_m": e_3d} | more
 
 
 @pytest.mark.parametrize("seed", range(5))

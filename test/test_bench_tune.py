@@ -78,3 +78,7 @@ def test_a_study_goes_on_and_leaves_settings_that_load(tmp_path):
         tune.SPACES["sensor"]
     )
     assert called("--data", f"pairs={tmp_path / 'rooms'}", "--trials", "0", "--out", tmp_path / "out")[0] == 0
+    code, printed = called(*words, "--limit", "2")
+    assert code == 2 and "is of other pairs or settings" in printed
+    code, printed = called(*words[:2], "--trials", "0", "--out", tmp_path / "new")
+    assert code == 2 and "no finished trial of sensor" in printed

@@ -42,12 +42,17 @@ def test_a_list_is_written_once(clips: Path) -> None:
 
 
 def test_metres_of_a_network_are_named_and_reach_the_rows(clips: Path, tmp_path: Path) -> None:
-    """Depth maps of frame 0 are made where missing; one that is there is left as it is."""
-    kept = (clips / "depth" / "a" / "0.png").read_bytes()
-    (clips / "depth" / "b" / "0.png").unlink()
+    """Depth maps of frame 0 are made where missing; those of somebody else are not taken for the network's."""
     code, printed = called(clips, "--each", 1, "--depth", "demo_net")
+    assert code == 2 and "holds depth maps (somebody else's), not of demo_net" in printed
+    for clip in "ab":
+        (clips / "depth" / clip / "0.png").unlink()
+    (clips / "cameras" / "test" / "broken.txt").write_text("https://example.org\n1 2 3\n")
+    (clips / "cameras" / "test" / "empty.txt").write_text("https://example.org\n")
+    code, printed = called(clips, "--each", 1, "--depth", "demo_net")
+    assert code == 2 and "broken.txt:2" in printed, printed
+    code, printed = called(clips, "--each", 1, "--depth", "demo_net", "--skip")
     assert code == 0 and "scale sfm-depth:demo_net" in printed, printed
-    assert (clips / "depth" / "a" / "0.png").read_bytes() == kept
     made = cv2.imread(str(clips / "depth" / "b" / "0.png"), cv2.IMREAD_UNCHANGED)
     assert made.dtype == np.uint16 and made.min() > 0
     words = ["--data", f"realestate10k={clips}", "--depth", "demo_net", "--starts", "disturbed", "--methods", "garps"]
@@ -64,6 +69,7 @@ def test_metres_of_a_network_are_named_and_reach_the_rows(clips: Path, tmp_path:
     [
         (["--depth", "guess"], "--depth is 'guess', --scale 'raw': expected one of demo_net"),
         (["--scale", "feet"], "scale is 'feet': expected one of raw, sfm-depth"),
+        (["--scale", "raw:x"], "scale is 'raw:x': expected one of raw, sfm-depth"),
         (["--split", "all"], "split is 'all': expected one of test, validation"),
         (["--each", "5"], "4 small and 4 large pairs are wanting"),
     ],
@@ -73,13 +79,22 @@ def test_mistakes_are_one_line(words: list[str], message: str, clips: Path) -> N
     assert code == 2 and message in printed and "Traceback" not in printed
 
 
-def test_clips_that_cannot_be_used_are_named(clips: Path) -> None:
-    write_track(clips, "c", motion(3, (0.1, 0, 0)))
-    code, printed = called(clips, "--each", 1, "--skip", "--seed", 3)
+def test_maps_that_are_there_are_kept(clips: Path) -> None:
+    kept = (clips / "depth" / "a" / "0.png").read_bytes()
+    (clips / "depth" / "made_by.txt").write_text("demo_net\n")
+    (clips / "depth" / "b" / "0.png").unlink()
+    code, printed = called(clips, "--each", 1, "--depth", "demo_net")
     assert code == 0, printed
-    (clips / "pairs_test.jsonl").unlink()
+    assert (clips / "depth" / "a" / "0.png").read_bytes() == kept
+    assert (clips / "depth" / "b" / "0.png").is_file()
+
+
+def test_clips_that_cannot_be_used_are_named(clips: Path) -> None:
     (clips / "frames" / "b" / "0.png").unlink()
     write_track(clips, "d", motion(3, (0.8, 0, 0)))
     write_frames(clips, "d")
-    code, printed = called(clips, "--each", 1, "--skip")
-    assert code == 0 and "1 small, 1 large" in printed
+    write_track(clips, "c", motion(3, (0.8, 0, 0)))
+    code, printed = called(clips, "--each", 1)
+    assert code == 2 and "missing:" in printed
+    code, printed = called(clips, "--each", 1, "--skip", "--seed", 1)
+    assert code == 0 and "1 small, 1 large" in printed and "left out: " in printed

@@ -16,7 +16,7 @@ from garps_core.geometry import se3_exp, se3_inverse
 from garps_core.lift import depth_sigma
 from garps_core.metrics import pose_error
 from garps_core.systematic import FIELD_SLOPE, shared_errors, shared_sigmas
-from garps_core.uncertainty import inflated_beyond, inverted, ros_from_twist, twist_from_ros
+from garps_core.uncertainty import inflated, inverted, ros_from_twist, twist_from_ros
 
 SMALL = {"camera": np.diag([0.5, 0.5, 1]) @ surfaces.K, "size": (60, 80)}
 FAR_POSE = np.eye(4)
@@ -160,16 +160,24 @@ def test_noisier_data_spread_a_linear_estimate_as_the_inflated_covariance_says(f
     y = rng.multivariate_normal(np.zeros(6), factor**2 * np.linalg.inv(D), size=DRAWS)
     x0 = rng.multivariate_normal(np.zeros(6), np.linalg.inv(K), size=DRAWS)
     found = (y @ D + x0 @ K) @ C
-    assert apart(inflated_beyond(C, K, factor), np.cov(found.T)) < 0.03
+    assert apart(inflated(C, C @ K @ C, factor), np.cov(found.T)) < 0.03
 
 
-def test_inflation_leaves_what_is_known_and_never_shrinks():
+def test_inflation_leaves_what_is_known():
     C = random_covariance(3)
-    assert inflated_beyond(C, np.eye(6), 1.0) is C
-    np.testing.assert_allclose(inflated_beyond(C, np.zeros((6, 6)), 3.0), 9 * C, rtol=1e-12)
-    np.testing.assert_allclose(inflated_beyond(C, np.linalg.inv(C), 3.0), C, atol=1e-12)
-    wider = inflated_beyond(C, 4 * np.linalg.inv(C), 3.0)  # C holds more than the prior left: a shared error, added
-    np.testing.assert_allclose(wider, C, atol=1e-12)
+    np.testing.assert_array_equal(inflated(C, 0.3 * C, 1.0), C)
+    np.testing.assert_allclose(inflated(C, np.zeros((6, 6)), 3.0), 9 * C, rtol=1e-12)
+    np.testing.assert_allclose(inflated(C, C, 3.0), C, rtol=1e-12)
+
+
+@pytest.mark.parametrize("depth_errors", [False, True])
+def test_shared_errors_are_inflated_as_the_data_they_come_from(depth_errors):
+    """A scale error of 5 % is most of the covariance, beside a vague start."""
+    config = Config().replace({"alignment.depth_errors": depth_errors, "lifting.scale_sigma": 0.05})
+    vague = disturbed(covariance=100 * FREE)
+    one, three = (estimated(config.replace({"lifting.sigma_inflation": f}), vague) for f in (1.0, 3.0))
+    ratio = sigmas(three) / sigmas(one)
+    assert (ratio > 2.9).all() and (ratio < 3.0001).all(), ratio
 
 
 def test_an_inflated_estimate_is_the_same_pose_with_larger_sigmas(plain):

@@ -151,7 +151,7 @@ def sample(
         ValueError: malformed tracks, no scale, not enough clips, or a list that exists.
     """
     path = folder / list_file(split)
-    if scale.partition(":")[0] not in SCALES:
+    if scale != RAW and scale.partition(":")[0] != SOURCE:
         raise ValueError(f"scale is {scale!r}: expected one of {', '.join(SCALES)}")
     if path.exists():
         raise ValueError(f"{path} exists: a list is written once; remove it to choose anew")
