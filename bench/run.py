@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every method on every pair: the evaluation bench.
 
-    python -m bench.run                                            # every accuracy table of docs/BENCHMARK.md
+    python -m bench.run --limit 120                                # every accuracy table of docs/BENCHMARK.md
     python -m bench.run --resume                                   # goes on with one that was stopped
     python -m bench.run --data realestate10k=FOLDER --depth depth_anything_v2 --methods garps,mast3r,sift-pnp
     python -m bench.run --methods ablations --depth monocular,demo_net --starts disturbed --out out/ablations
@@ -127,7 +127,9 @@ def main(
     methods: Annotated[str, typer.Option(help="comma-separated; see --list")] = BY_DEFAULT,
     settings: Annotated[Path | None, typer.Option(help="YAML of settings, as bench.tune writes")] = None,
     change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, spread evenly")] = None,
+    limit: Annotated[
+        int | None, typer.Option(help="at most so many pairs of a set: spread evenly, of learned rooms the first")
+    ] = None,
     half: Annotated[
         str, typer.Option(help=f"of each pairs.json: {', '.join(HALVES)}; dev takes generated rooms to tune on")
     ] = "all",

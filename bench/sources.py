@@ -66,7 +66,7 @@ def pairs_of(source: str, limit: int | None, workers: int, console: Console, hal
 
     Args:
         source: NAME=FOLDER.
-        limit: at most so many, spread evenly.
+        limit: at most so many, spread evenly; of learned rooms the first.
         workers: processes that make rooms.
         console: for bars, and what is left out.
         half: of a folder with a pairs.json; of generated rooms "dev" takes those to tune on, else those to report.
