@@ -166,7 +166,7 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     for shared in (f.from_points + A.T @ b.from_pixels, f.from_pixels + A.T @ b.from_points):  # source, target
         effect = np.linalg.solve(H, shared) * shared_sigmas(config.lifting)
         covariance += effect @ effect.T
-    return T, ros_from_twist(np.asarray(covariance * config.lifting.sigma_inflation**2, np.float64), T)
+    return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 
 
 def _both(T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config) -> tuple[Normal, Normal, Array]:
