@@ -175,6 +175,8 @@ def write_plots(rows: Sequence[Row], folder: Path) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
         part = [row for row in rows if pair_of(row)[:3] == place]
+        able = {row["method"] for row in part if row["found"]}
+        part = [row for row in part if row["method"] in able]
         for name, draw in PLOTS.items():
             file = re.sub(r"[^\w.-]+", "_", "_".join((*filter(None, place), name)))
             try:

@@ -101,10 +101,7 @@ class Lifting(Checked):
         5e-4, "error of the direction a pixel looks in (0.25 px at a focal length of 500 px)", unit="rad", low=0, high=1
     )
     sigma_inflation: float = setting(
-        1.0,
-        "sigmas of what this depth adds to a pose, times this: errors of another kind (calibrated)",
-        low=1,
-        high=100,
+        1.0, "sigmas of what this depth says, times this: for errors of another kind (calibrated)", low=1, high=100
     )
     edge_ratio: float = setting(
         0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
