@@ -27,7 +27,7 @@ from rich.console import Console
 from bench import learned_rooms
 from bench.datasets import DATA, Pair, available, disturbed_prior, load_pairs, spread
 from bench.depth_errors import depth_errors
-from bench.learned_rooms import with_learned_depth
+from bench.sources import DEMO_NET, config_of, with_depth_of
 from garps_core import Config, estimate_relative_pose, metrics
 from garps_core.models.demo_net import DemoNet, depth_of, shipped
 from garps_core.types import View
@@ -59,16 +59,15 @@ def _sensor(view: View) -> npt.NDArray[np.float32]:
     return view.depth
 
 
-def pose_rows(pairs: Sequence[Pair], network: DemoNet) -> list[str]:
+def pose_rows(pairs: Sequence[Pair]) -> list[str]:
     """Markdown rows: median E_3D (m) from a disturbed start with either depth, and how often it says `converged`."""
     found = []
     for name in dict.fromkeys(pair.set for pair in pairs):
         own = [pair for pair in pairs if pair.set == name]
         starts = [disturbed_prior(pair) for pair in own]
         cells = [f"{_median_e3d(own, [s.T_target_source for s in starts]):.4f}"]
-        learned = [with_learned_depth(pair, network) for pair in own]
-        given = Config.preset("demo_net").replace({"reconstruction.method": "rgbd"})
-        for views, config in ((own, Config()), (learned, given)):
+        learned = [with_depth_of(pair, DEMO_NET) for pair in own]
+        for views, config in ((own, Config()), (learned, config_of(DEMO_NET))):
             results = [
                 estimate_relative_pose(pair.source, pair.target, config, start)
                 for pair, start in zip(views, starts, strict=True)
@@ -153,7 +152,7 @@ def main(
         ]
         lines += ["|---" * 7 + "|", *depth_rows(pairs, network), ""]
         lines += ["| set | pairs | start, median E_3D m | sensor's depth (converged) | demo_net (converged) |"]
-        lines += ["|---" * 5 + "|", *pose_rows(pairs, network), ""]
+        lines += ["|---" * 5 + "|", *pose_rows(pairs), ""]
     else:
         lines.append(f"no photographs with sensor depth under {data / 'dev'}")
     console.print("\n".join(lines))

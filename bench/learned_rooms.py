@@ -4,13 +4,13 @@
     python -m bench.learned_rooms
 
 Seeds are not those of the rooms to learn from (`bench.depth_data`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
-35 deg and 1 m) and kinds take turns. Depth is the truth's here; `with_learned_depth` puts the network's in its place.
+35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.sources.with_depth_of` puts a network's in its
+place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +25,6 @@ from bench.datasets import Pair, scene_points
 from bench.jobs import computed
 from bench.rooms import LEVELS, make_pair
 from garps_core import View
-from garps_core.models.demo_net import DemoNet, depth_of
 
 SET = "learned_rooms"
 FOLDER = Path("out/learned_rooms")
@@ -92,12 +91,6 @@ def _read(seed: int, path: Path) -> Pair:
         T, labels = file["T"], file["labels"].astype(np.int32)
     name = f"room{seed}_level{level_of(seed)}"
     return Pair(SET, name, kind_of(seed), views[0], views[1], T, scene_points(views[0]), labels=(labels[0], labels[1]))
-
-
-def with_learned_depth(pair: Pair, network: DemoNet) -> Pair:
-    """The pair with the network's depth; `points` stay true."""
-    source, target = depth_of(network, [pair.source, pair.target])
-    return replace(pair, source=replace(pair.source, depth=source), target=replace(pair.target, depth=target))
 
 
 def few_matches(pairs: Sequence[Pair], limit: int) -> int:

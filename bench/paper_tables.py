@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import binomtest
 
+from bench.ablations import ERRORS
 from bench.intervals import paired_difference
 from bench.scores import INF, THRESHOLDS_DEG, VCRE_PX, precision_auc
 from bench.statistics_blocks import (
@@ -33,8 +34,8 @@ from bench.statistics_blocks import (
     spread,
 )
 from bench.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row
+from garps_core.checks import Float64Array
 
-ERRORS = {"e_trans_m": "E_trans", "e_rot_deg": "E_rot", "e_3d_m": "E_3D"}
 ALL_PAIRS = {"e_rot_deg": "E_rot", "e_dir_deg": "E_dir", "e_trans_m": "E_trans", "e_3d_m": "E_3D"}
 DIGITS_M, DIGITS_DEG, DIGITS_S = 4, 3, 3
 TIME = (
@@ -114,13 +115,6 @@ def all_pairs_table(rows: Sequence[Row]) -> str:
     return _by_method("Medians and AUC over all pairs, failures at infinity", rows, columns, end)
 
 
-def _finite_errors(pairs: Sequence[tuple[Row, Row]], error: str) -> tuple[np.ndarray, np.ndarray]:
-    """An error of both rows of the pairs in which both have it."""
-    ours, theirs = (errors_of([pair[i] for pair in pairs], error) for i in (0, 1))
-    both = np.isfinite(ours) & np.isfinite(theirs)
-    return ours[both], theirs[both]
-
-
 def difference_table(rows: Sequence[Row], method: str = GARPS, error: str = "e_3d_m") -> str:
     """An error of one method less that of every other on the same pairs: median, mean, and who is better how often.
 
@@ -135,19 +129,20 @@ def difference_table(rows: Sequence[Row], method: str = GARPS, error: str = "e_3
         ours, theirs = (errors_of([pair[i] for pair in pairs], error) for i in (0, 1))
         better, worse = int((ours < theirs).sum()), int((ours > theirs).sum())
         p = f"{binomtest(better, better + worse).pvalue:.2g}" if better + worse else "-"
-        lines.append([other, *_differences(*_finite_errors(pairs, error)), f"{better} / {worse}", p])
+        lines.append([other, *_differences(ours, theirs), f"{better} / {worse}", p])
     headings = ["Against", "n both", "Median [95 %]", "Mean [95 %]", "Better / worse", "Sign test p"]
     caption = f"{_heading(error, rows)} of {method} less that of others, pair by pair (negative: {method} is better)"
     end = " Sign test: over all pairs, failures at infinity; two-sided p, not corrected for the number of methods."
     return _table(caption, headings, lines, rows, end)
 
 
-def _differences(ours: np.ndarray, theirs: np.ndarray) -> list[str]:
-    """Number of pairs; median and mean of the paired differences."""
-    if not len(ours):
+def _differences(ours: Float64Array, theirs: Float64Array) -> list[str]:
+    """Of the pairs in which both errors are finite: their number, median and mean of the paired differences."""
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    if not both.any():
         return ["0", "-", "-"]
-    apart, zero = ours - theirs, np.zeros(len(ours))
-    return [f"{len(ours)}", *(str(paired_difference(apart, zero, statistic)) for statistic in (np.median, np.mean))]
+    apart, zero = ours[both] - theirs[both], np.zeros(both.sum())
+    return [f"{both.sum()}", *(str(paired_difference(apart, zero, statistic)) for statistic in (np.median, np.mean))]
 
 
 def category_table(rows: Sequence[Row]) -> str:

@@ -16,6 +16,7 @@ from bench.depth_errors import depth_tables
 from bench.paper_tables import paper_tables
 from bench.plots import write_plots
 from bench.sources import with_depth_of
+from bench.statistics_blocks import pair_of
 from bench.tables import GARPS, START, Row, print_tables, write
 from garps_core import Config, reconstruct
 from garps_core.figure import before_after
@@ -69,27 +70,23 @@ def write_pictures(
 ) -> Iterator[Path]:
     """The pair of median error of every table, at the start and as GARPS leaves it; at most `MAX_PICTURES`."""
     of_pair = {(pair.set, pair.id): pair for pair in pairs}
-    starts = {_place(row): row for row in rows if row["method"] == START and row["found"]}
-    own = [row for row in rows if row["method"] == GARPS and row["found"] and _place(row) in starts]
-    tables = list(dict.fromkeys(_place(row)[:3] for row in own))
+    starts = {pair_of(row): row for row in rows if row["method"] == START and row["found"]}
+    own = [row for row in rows if row["method"] == GARPS and row["found"] and pair_of(row) in starts]
+    tables = list(dict.fromkeys(pair_of(row)[:3] for row in own))
     for table in tables[:MAX_PICTURES]:
-        chosen = sorted((row for row in own if _place(row)[:3] == table), key=lambda row: float(row["e_3d_m"]))
+        chosen = sorted((row for row in own if pair_of(row)[:3] == table), key=lambda row: float(row["e_3d_m"]))
         row = chosen[len(chosen) // 2]
         if (pair := of_pair.get((row["set"], row["pair"]))) is None:
             continue
         out.mkdir(parents=True, exist_ok=True)
         seen = with_depth_of(pair, row["depth"], seed)
         mixtures = [reconstruct(view, configs[row["depth"]]) for view in (seen.source, seen.target)]
-        start = starts[_place(row)]
+        start = starts[pair_of(row)]
         title = (
             f"{row['set']}, {row['pair']}, depth {row['depth']}, start {row['start']}: E_3D {start['e_3d_m']:.4f} m "
             f"before, {row['e_3d_m']:.4f} m after"
         )
         yield before_after(*mixtures, _pose(start), _pose(row), out / f"{'_'.join(table)}.png", title)
-
-
-def _place(row: Row) -> tuple[str, str, str, str]:
-    return row["depth"], row["set"], row["start"], row["pair"]
 
 
 def _pose(row: Row) -> np.ndarray:

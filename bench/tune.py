@@ -191,7 +191,7 @@ def main(
     depth: Annotated[str, typer.Option(help=f"which preset: {', '.join(SPACES)}")] = SENSOR,
     trials: Annotated[int, typer.Option(help="so many more; 0 = only report")] = 40,
     data: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER, as of bench.run; repeat at will")] = None,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, spread evenly")] = None,
+    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, as of bench.run")] = None,
     out: Annotated[Path, typer.Option(help="folder of the study; one that is there goes on")] = Path("out/tune"),
 ) -> None:
     """Choose settings on one half of the pairs, report on the other."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bench.datasets import Pair
+from bench.tables import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
 from garps_core.align import best_of
 from garps_core.errors import GarpsError, InitialisationError
@@ -21,7 +22,6 @@ from garps_core.initialise import initialise
 from garps_core.models.semantics import labelled
 from garps_core.reconstruct import mixtures_of, with_depth
 
-GARPS = "garps"
 GARPS_NO_FEATURES = "garps-no-features"
 GARPS_PAPER = "garps-paper"
 VAGUE = 1e4

@@ -234,15 +234,15 @@ def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
 def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool, config: Config) -> Finding:
     """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
-    covariance, of_known = pose_covariance(solution, known, config.lifting), share_of_known(solution, known)
-    seen = None
+    covariance, kept, seen = pose_covariance(solution, known, config.lifting), np.eye(6), None
     if x.frustum is not None and y.frustum is not None:
         prior = twist_from_ros(covariance, T) * (SEARCHED_SIGMAS**2 if guess else 1.0)
         seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
     if seen is not None and settings.brightness > 0:
-        T, covariance = seen.T, ros_from_twist(seen.covariance, seen.T)
-        of_known = seen.kept @ of_known @ seen.kept.T
-    covariance = inflated(covariance, ros_from_twist(of_known, T), config.lifting.sigma_inflation)
+        T, covariance, kept = seen.T, ros_from_twist(seen.covariance, seen.T), seen.kept
+    if config.lifting.sigma_inflation > 1:
+        of_known = ros_from_twist(kept @ share_of_known(solution, known) @ kept.T, T)
+        covariance = inflated(covariance, of_known, config.lifting.sigma_inflation)
     common = config.lifting.common_scale_sigma
     if config.reconstruction.method == "two_view":
         common = config.start.network_scale_sigma

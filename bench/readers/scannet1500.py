@@ -2,10 +2,10 @@
 """ScanNet-1500: 1500 pairs of indoor RGB-D frames, the usual set for relative pose.
 
     FOLDER/test.npz                                     `name` (n, 4) whole numbers: scene, scan, frame 0, frame 1
-    FOLDER/sceneXXXX_YY/color/N.jpg                     resized here to 640x480
-    FOLDER/sceneXXXX_YY/depth/N.png                     640x480, 16 bit, mm, 0 = none
-    FOLDER/sceneXXXX_YY/pose/N.txt                      4x4 camera to world, m
-    FOLDER/sceneXXXX_YY/intrinsic/intrinsic_depth.txt   4x4; without it intrinsic_color.txt is taken and resized
+    FOLDER/sceneNNNN_NN/color/N.jpg                     resized here to 640x480
+    FOLDER/sceneNNNN_NN/depth/N.png                     640x480, 16 bit, mm, 0 = none
+    FOLDER/sceneNNNN_NN/pose/N.txt                      4x4 camera to world, m
+    FOLDER/sceneNNNN_NN/intrinsic/intrinsic_depth.txt   4x4; without it intrinsic_color.txt is taken and resized
 
 As of the release that the matchers' repositories link to (`scannet_test_1500`), colour and depth cameras count as one.
 Where test.npz also has `rel_pose` (n, 12: rows of the 3x4 source-to-target matrix), it has to agree with the poses.
@@ -42,7 +42,7 @@ from garps_core.types import View
 
 NAME = "scannet1500"
 SIZE = (640, 480)
-LAYOUT = "test.npz and sceneXXXX_YY/ with color/N.jpg, depth/N.png, pose/N.txt and intrinsic/intrinsic_depth.txt"
+LAYOUT = "test.npz and sceneNNNN_NN/ with color/N.jpg, depth/N.png, pose/N.txt and intrinsic/intrinsic_depth.txt"
 AGREE_M, AGREE_DEG = 0.05, 1.0
 
 
