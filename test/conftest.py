@@ -3,12 +3,17 @@
 
 import os
 import socket
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 # Without this, Jazzy accepts a scalar of the wrong type and publishes garbage for it.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+
+# For the whole process: Fast DDS reads it at the first context and never again. Without it, images that two cameras
+# send at once do not fit into a process' 512 KiB of shared memory, and on a busy machine never arrive.
+os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).resolve().parent / "fast_discovery.xml")
 
 # No deadline: a shared machine may stall for longer than any example takes. The same examples every time, so that a
 # change is judged by what it changes; GARPS_TEST_PROFILE=explore looks for new ones.

@@ -39,7 +39,6 @@ __all__ = [
     "private_domain", "room_pair",
 ]  # fmt: skip
 
-FAST_DISCOVERY = ROOT / "test" / "fast_discovery.xml"
 FIRST_PORT = 21000
 """A domain is held by a listening socket on this port + its number."""
 DOMAINS = range(1, 102)  # beyond, DDS would use ports that Linux hands out to anybody
@@ -64,7 +63,6 @@ def private_domain(folder: Path) -> Iterator[Domain]:
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "ROS_LOG_DIR": str(folder),
             "ROS_PYTHON_CHECK_FIELDS": "1",
-            "FASTRTPS_DEFAULT_PROFILES_FILE": str(FAST_DISCOVERY),
         }
         theirs = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONFAULTHANDLER": "1"}
         with mock.patch.dict(os.environ, ours):

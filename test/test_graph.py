@@ -3,6 +3,7 @@
 
 import signal
 import time
+from pathlib import Path
 
 import pytest
 from graph import Camera, NodeProcess, Peer, private_domain, room_pair
@@ -36,6 +37,14 @@ def test_two_peers_find_each_other_within_a_second(domain):
         two.wait(lambda: heard, what="the word")
         assert time.monotonic() - began < 1.0
         assert heard[0][1].data == "hello"
+
+
+def test_a_peer_has_room_for_images_whatever_ran_in_this_process_before(domain):
+    """Fast DDS reads its profile once per process: a file run earlier, without it, would decide for all."""
+    with Peer(domain):
+        mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if "/fastrtps_" in line]
+    ends = [[int(end, 16) for end in words[0].split("-")] for words in mapped]
+    assert max(end - start for start, end in ends) > 32 * 2**20
 
 
 def test_two_domains_do_not_hear_each_other(domain, tmp_path):
