@@ -13,6 +13,7 @@ from typing import Any
 from garps_core.alignment_settings import Alignment, Rung
 from garps_core.described import Checked, flattened, replaced, setting
 from garps_core.errors import ConfigError
+from garps_core.reconstruction_settings import DEPTH_NETWORKS, METHODS, SCENES, Reconstruction
 
 __all__ = [
     "DEPTH_NETWORKS",
@@ -30,52 +31,9 @@ __all__ = [
     "preset_for",
 ]
 
-METHODS = ("auto", "rgbd", "depth_anything_v2", "demo_net", "flash3d", "two_view", "ply")
-DEPTH_NETWORKS = ("depth_anything_v2", "demo_net")
-"""Of them those that give depth of one image, which is then lifted like a sensor's."""
 TWO_VIEW = ("mast3r", "dust3r", "adapter")
 """Starts by a two-view network."""
 STARTS = ("auto", "features", "identity", *TWO_VIEW)
-SCENES = ("any", "indoor", "outdoor")
-
-
-@dataclass(frozen=True)
-class Reconstruction(Checked):
-    """What turns a view into a mixture (`reconstruct`), and which weights it uses (`docs/weights.md`)."""
-
-    method: str = setting(
-        "auto",
-        "rgbd = the sensor's depth; a network; demo_net = the one in the package, a demonstration; two_view = that of "
-        "start.method, which then runs once for both; ply = mixtures from files; auto = depth_anything_v2 without a "
-        "sensor",
-        choices=METHODS,
-        live=False,
-    )
-    depth_weights: str = setting(
-        "", "of the depth network: a name or a file; empty = the first that is installed", live=False
-    )
-    flash3d_weights: str = setting("", "of Flash3D, likewise", live=False)
-    scene: str = setting(
-        "any", "what depth_weights must be made for; told here where the file does not", choices=SCENES, live=False
-    )
-    depth_scale: float = setting(1.0, "factor on the network's depth", unit="", low=1e-3, high=1e3)
-    focal_correction: bool = setting(
-        False, "network's depth times the focal length over that of its training, both over the image's width"
-    )
-    drop_border: bool = setting(False, "leave out the Gaussians that Flash3D sets around the picture")
-    semantics: str = setting(
-        "none",
-        "labels by DINOv2 (linear, ms) or Mask2Former; none = `alignment.semantic_discount` has no effect",
-        choices=("none", "linear", "ms", "m2f"),
-        live=False,
-    )
-    semantic_weights: str = setting(
-        "", "of the head, or of all of m2f: a name or a file; empty = the first installed", live=False
-    )
-    semantic_backbone: str = setting("", "weights of DINOv2 for linear and ms, likewise", live=False)
-    network_dtype: str = setting(
-        "float32", "what networks compute in; the other two for GPUs", choices=("float32", "float16", "bfloat16")
-    )
 
 
 @dataclass(frozen=True)
@@ -94,6 +52,9 @@ class Lifting(Checked):
     )
     scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
     warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
+    patch_sigma: float = setting(
+        0.0, "relative error of depth that differs from place to place, too large for noise", low=0, high=1
+    )
     common_scale_sigma: float = setting(
         0.0, "relative scale error that both depth maps have in common, so that no picture shows it", low=0, high=1
     )
@@ -257,21 +218,23 @@ def _mast3r() -> Config:
 def _demo_net() -> Config:
     """Two images by the network in the package, a demonstration that knows generated rooms only.
 
-    Its depth is off by 10 % in scale, half of that in both maps alike, and 15 % in shape (docs/demo_net.md): several
-    times what `monocular` takes for usual, so mixtures, brightness and features all count for less.
+    Its depth is off by 10 % in scale, half of that in both maps alike, and 15 % in shape (docs/demo_net.md), several
+    times what `monocular` takes for usual: mixtures count for less, features and brightness across epipolar lines only.
     """
     return _monocular().replace(
         {
             "reconstruction.method": "demo_net",
             "lifting.scale_sigma": 0.12,
             "lifting.warp_sigma": 0.15,
+            "lifting.patch_sigma": 0.2,
             "lifting.common_scale_sigma": 0.08,
             "lifting.sigma_inflation": 2.2,
             "lifting.noise_linear": 0.1,
-            "start.covariance_inflation": 15.0,
+            "start.covariance_inflation": 5.0,
+            "start.min_inliers": 15,
             "alignment.information": 0.3,
-            "alignment.brightness": 0.003,
-            "alignment.occlusion_ratio": 0.3,
+            "alignment.brightness": 0.02,
+            "alignment.occlusion_ratio": 0.5,
         }
     )
 

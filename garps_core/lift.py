@@ -150,7 +150,7 @@ def _lift(
         area if lifting.weighting == "area" else np.ones_like(area),
         view.rgb[v, u].astype(np.float32) / np.float32(255),
         None,
-        frustum_of(view, depth),
+        frustum_of(view, depth, lifting),
     )
 
 
@@ -216,11 +216,11 @@ def _covariances(
     return covariances
 
 
-def frustum_of(view: View, depth: Float32Array) -> Frustum:
+def frustum_of(view: View, depth: Float32Array, lifting: Lifting) -> Frustum:
     """What the camera of the view could see, on a coarse grid; depth is HxW m, NaN where unknown."""
     step = FRUSTUM_STEP_PX
     K = view.K.copy()
     K[:2] /= step
     K[:2, 2] -= (step // 2) / step  # grid cell i holds pixel i * step + step // 2
     seen = np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step])
-    return Frustum(K, seen, brightness_of(view.rgb, step))
+    return Frustum(K, seen, brightness_of(view.rgb, step), lifting.patch_sigma)

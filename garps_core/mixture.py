@@ -21,11 +21,13 @@ class Frustum:
         K: 3x3 pixels of the depth map's own grid.
         depth: hxw float32 metres, NaN = unknown (then nothing is called hidden there).
         brightness: hxw float32 0..1 on the same grid; None = not known, then the pose is not sharpened by it.
+        patch_sigma: relative error of the depth that differs from place to place (`lifting.patch_sigma`).
     """
 
     K: Float64Array
     depth: Float32Array
     brightness: Float32Array | None = None
+    patch_sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

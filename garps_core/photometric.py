@@ -58,7 +58,7 @@ class Sharpened:
 
 @dataclass(frozen=True)
 class Grid:
-    """One resolution of a view: image, its slopes, depth and intrinsics; and points (n, 3) m with their brightness."""
+    """One resolution of a view: image, its slopes, depth and intrinsics; points (n, 3) m with their brightness."""
 
     image: Float32Array
     slope_x: Float32Array
@@ -67,6 +67,8 @@ class Grid:
     K: Array
     points: Array
     brightness: Array
+    patch_sigma: float
+    """Relative error of the points' depth that differs from place to place."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def grid_of(view: Frustum, step: int) -> Grid:
         strongest = np.sort(np.argpartition(-strength, MAX_POINTS)[:MAX_POINTS])
         u, v = u[strongest], v[strongest]
     points = pixel_rays(K, u.astype(float), v.astype(float)) * depth[v, u].astype(float)[:, None]
-    return Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float))
+    return Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float), view.patch_sigma)
 
 
 def _on_one_surface(depth: Float32Array) -> npt.NDArray[np.bool_]:
@@ -215,10 +217,11 @@ def _compared(x: Grid, y: Grid, T: Array) -> Comparison | None:
         return None
     slope_x, slope_y = (_sampled(image, *seen.pixel.T) for image in (y.slope_x, y.slope_y))
     exposure = np.stack([seen.own, np.ones_like(seen.own)], axis=1)
-    error, weights = _robust(seen.theirs, exposure)
     z = seen.moved[:, 2]
     a, b = slope_x * y.K[0, 0] / z, slope_y * y.K[1, 1] / z
     slope = np.stack([a, b, -(a * seen.moved[:, 0] + b * seen.moved[:, 1]) / z], axis=1)  # brightness per metre
+    by_depth = (slope * (x.points[seen.inside] @ T[:3, :3].T)).sum(1)  # brightness per unit of relative depth error
+    error, weights = _robust(seen.theirs, exposure, np.square(x.patch_sigma * by_depth))
     J = np.concatenate([slope, np.cross(seen.moved, slope)], axis=1)
     weighted = exposure * weights[:, None]
     J = J - exposure @ np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ J)  # exposure is free
@@ -246,8 +249,8 @@ def _sampled(image: Float32Array, u: Array, v: Array) -> Array:
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR)[0], np.float64)
 
 
-def _robust(theirs: Array, exposure: Array) -> tuple[Array, Array]:
-    """Residuals after the best gain and offset, and Tukey's weights over the residuals' own variance."""
+def _robust(theirs: Array, exposure: Array, variance: Array) -> tuple[Array, Array]:
+    """Residuals after the best gain and offset, and Tukey's weights over their own variance and the one given (n,)."""
     weights = np.ones(len(theirs))
     for _ in range(3):
         weighted = exposure * weights[:, None]
@@ -255,4 +258,4 @@ def _robust(theirs: Array, exposure: Array) -> tuple[Array, Array]:
         error = theirs - exposure @ fit
         sigma = max(1.4826 * float(np.median(np.abs(error))), SMALLEST_SIGMA)
         weights = np.square(np.maximum(1 - np.square(error / (TUKEY * sigma)), 0))
-    return error, weights / sigma**2
+    return error, weights / (sigma**2 + variance)

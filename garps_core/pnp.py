@@ -5,6 +5,10 @@ PoseLib finds the pose and its inliers; the joint refinement and its covariance 
 what the alignment takes as the prior. A residual's noise is the pixel noise plus what the depth noise of its 3D
 point does to the pixel; errors that all points of a view share (scale, slow warp of a depth map) do not average
 out, and are added through their effect on the pose (`systematic.py`).
+
+What depth errors do to a pixel lies along its epipolar line. Where a network's depth is off from place to place
+(`lifting.patch_sigma`), residuals along it count for less, down to the epipolar error alone, and the pose from
+bearings (`bearings.py`) is one more to begin with.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import poselib
 
+from garps_core.bearings import pinhole, pose_from_bearings
 from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
@@ -49,14 +54,14 @@ def pose_from_matches(matches: Matches, source: View, target: View, config: Conf
     has_s, has_t = (np.isfinite(p[:, 0]) for p in (matches.source_points, matches.target_points))
     forward = OneWay(matches.source_points[has_s], matches.target_px[has_s], target.K)
     backward = OneWay(matches.target_points[has_t], matches.source_px[has_t], source.K)
-    need, threshold = config.start.min_inliers, config.start.ransac_px
-    candidates = [
-        pose
-        for pose in (ransac(forward, threshold, config), _inverse(ransac(backward, threshold, config)))
-        if pose is not None
-    ]
+    need, gate = config.start.min_inliers, (config.start.ransac_px, config.lifting.patch_sigma)
+    candidates = [ransac(forward, gate[0], config), _inverse(ransac(backward, gate[0], config))]
+    if config.lifting.patch_sigma > 0:
+        candidates.append(pose_from_bearings(matches, source.K, target.K, config))
     scored = [
-        (inliers_of(forward, T, threshold), inliers_of(backward, se3_inverse(T), threshold), T) for T in candidates
+        (inliers_of(forward, T, *gate), inliers_of(backward, se3_inverse(T), *gate), T)
+        for T in candidates
+        if T is not None
     ]
     if not scored:
         raise InitialisationError(f"{len(matches)} feature matches, {has_s.sum()} with depth: no pose fits them")
@@ -74,11 +79,9 @@ def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) 
     """Pose that maps way.points into the camera that saw way.px, after so many trials at least; None without any."""
     if len(way.points) < max(4, config.start.min_inliers):
         return None
-    parameters = [way.K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    camera = {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}  # the size is of no use to it
     trials = {"min_iterations": least, "max_iterations": 10_000, "seed": config.seed}
     options = {"max_reproj_error": threshold_px, **trials}
-    pose, info = poselib.estimate_absolute_pose(way.px, way.points, camera, options, {})
+    pose, info = poselib.estimate_absolute_pose(way.px, way.points, pinhole(way.K), options, {})
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = pose.R, pose.t
     return T if info["num_inliers"] >= 4 and np.isfinite(T).all() else None
@@ -88,12 +91,44 @@ def _inverse(T: Array | None) -> Array | None:
     return None if T is None else se3_inverse(T)
 
 
-def inliers_of(way: OneWay, T: Array, threshold_px: float) -> Bool:
-    """Which of the way's points T brings in front of the camera and within so many pixels of where it saw them."""
+def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 0.0) -> Bool:
+    """Which of the way's points T brings in front of the camera and within so many pixels of where it saw them.
+
+    Where depth is off by `patch_sigma` from place to place, so many sigmas of that and of one pixel are allowed.
+    """
     moved = transform(T, way.points)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.linalg.norm(project(way.K, moved) - way.px, axis=-1)
-    return np.asarray((moved[:, 2] > 0.01) & (error < threshold_px))
+        error = project(way.K, moved) - way.px
+        sigmas = whitened(error, by_depth(way, T, moved), 1.0, patch_sigma)
+    return np.asarray((moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
+
+
+def by_depth(way: OneWay, T: Array, moved: Array) -> Array:
+    """(n, 2) pixels per unit of relative error in the depth of the way's points, which T has moved."""
+    turned = (T[:3, :3] @ way.points.T).T
+    return np.asarray((_by_point(way.K, moved) @ turned[..., None])[..., 0])
+
+
+def _by_point(K: Array, moved: Array) -> Array:
+    """(n, 2, 3) pixels per metre that a point in front of the seeing camera moves."""
+    x, y, z = moved.T
+    D = np.zeros((len(z), 2, 3))
+    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * x / z**2
+    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * y / z**2
+    return D
+
+
+def whitened(residual: Array, along: Array, pixel_sigma: float, patch_sigma: float) -> Array:
+    """Residuals (n, 2) px, but in units of what depth errors add where they show: `along`, pixels per unit of them.
+
+    A residual of pixel noise with the covariance s^2 1 + p^2 a a' becomes one with s^2 1.
+    """
+    if patch_sigma == 0:
+        return residual
+    length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    direction = along / length
+    share = pixel_sigma / np.hypot(pixel_sigma, patch_sigma * length)
+    return np.asarray(residual - direction * (residual * direction).sum(1, keepdims=True) * (1 - share))
 
 
 def keep(way: OneWay, mask: Bool) -> OneWay:
@@ -114,6 +149,7 @@ class Normal:
     from_pixels: Array
     """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
     residual_px: Array
+    """(n, 2), `whitened`: their spread is that of pixels."""
 
     @property
     def H(self) -> Array:
@@ -129,16 +165,13 @@ class Normal:
 def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
     """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
     moved = transform(T, way.points)
-    x, y, z = moved.T
     residual = project(way.K, moved) - way.px
-    D = np.zeros((len(z), 2, 3))  # d pixel / d point in the seeing camera
-    D[:, 0, 0], D[:, 0, 2] = way.K[0, 0] / z, -way.K[0, 0] * x / z**2
-    D[:, 1, 1], D[:, 1, 2] = way.K[1, 1] / z, -way.K[1, 1] * y / z**2
+    D = _by_point(way.K, moved)
     J = D @ point_jacobian(moved)
-    along = D @ (T[:3, :3] @ way.points.T).T[..., None]  # pixels per unit of relative depth
+    along = by_depth(way, T, moved)
     sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / PATCH_AVERAGE
-    relative = sigma / np.maximum(way.points[:, 2], 1e-6)
-    C = pixel_sigma**2 * np.eye(2) + along @ along.transpose(0, 2, 1) * relative[:, None, None] ** 2
+    relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
+    C = pixel_sigma**2 * np.eye(2) + along[:, :, None] * along[:, None, :] * relative[:, None, None] ** 2
     W = np.linalg.inv(C)
     size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
     W = W * np.minimum(1.0, HUBER / size)[:, None, None]
@@ -147,7 +180,8 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     pointing = np.zeros((2, 8))
     pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
     scores = (JW @ residual[..., None])[..., 0]
-    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, residual)
+    left = whitened(residual, along, pixel_sigma, lifting.patch_sigma)
+    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, left)
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:

@@ -210,7 +210,7 @@ def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     kept = np.isfinite([pixels(pose)[:, 0] for pose in reach]).all(axis=0)
     x = replace(x, points=x.points[kept], brightness=x.brightness[kept])
     exposure = np.stack([x.brightness, np.ones(kept.sum())], axis=1)
-    _, weights = photometric._robust(photometric._sampled(y.image, *pixels(T).T), exposure)
+    _, weights = photometric._robust(photometric._sampled(y.image, *pixels(T).T), exposure, np.zeros(kept.sum()))
 
     def cost(pose):
         theirs = photometric._sampled(y.image, *pixels(pose).T)

@@ -231,7 +231,7 @@ def gaussians_to_mixture(
         weights=gaussians.opacities[kept] * (area if lifting.weighting == "area" else np.float32(1)),
         colours=gaussians.colours[kept],
         labels=None if labels is None else labels_of(labels, view, gaussians.index[kept]),
-        frustum=frustum_of(view, in_range(view.depth, lifting)),
+        frustum=frustum_of(view, in_range(view.depth, lifting), lifting),
     )
 
 
