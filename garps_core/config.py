@@ -174,10 +174,14 @@ def _time_of_flight() -> Config:
 
 
 def _monocular() -> Config:
-    """Metric depth from one image: right to a few per cent in scale and shape, which are solved for with the pose."""
+    """Metric depth from one image: right to a few per cent in scale and shape, which are solved for with the pose.
+
+    And off by as much from one thing to the next: matches may fit by chance what is allowed for that, so more must.
+    """
     ladder = (Rung(100.0, 1000, 20, 8), Rung(30.0, 1500, 20, 8), Rung(10.0, 2000, 15, 10), Rung(4.0, 3000, 15, 15))
     return Config(
-        lifting=Lifting(noise_floor_m=6e-3, noise_linear=0.03, scale_sigma=0.03, warp_sigma=0.02),
+        lifting=Lifting(noise_floor_m=6e-3, noise_linear=0.03, scale_sigma=0.03, warp_sigma=0.02, patch_sigma=0.03),
+        start=Start(min_inliers=10),
         alignment=Alignment(
             ladder=ladder,
             search_ladder=Alignment().search_ladder[:2] + ladder[1:],
@@ -211,8 +215,12 @@ def _paper_full() -> Config:
 
 
 def _mast3r() -> Config:
-    """Two images and nothing else: MASt3R gives the initial pose and both depth maps in one pass. Non-commercial."""
-    return _monocular().replace({"start.method": "mast3r", "reconstruction.method": "two_view"})
+    """Two images and nothing else: MASt3R gives the initial pose and both depth maps in one pass. Non-commercial.
+
+    Both depth maps come from one look at both views, and fit each other from place to place.
+    """
+    of_pair = {"start.method": "mast3r", "reconstruction.method": "two_view"}
+    return _monocular().replace(of_pair | {"lifting.patch_sigma": 0.0, "start.min_inliers": Start().min_inliers})
 
 
 def _demo_net() -> Config:

@@ -138,7 +138,7 @@ def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
     T = ransac(of_one, THRESHOLD_PX, config, MIN_TRIALS)
     count = 0
     if T is not None:
-        fitting = inliers_of(of_one, T, THRESHOLD_PX)
+        fitting = inliers_of(of_one, T, THRESHOLD_PX, config.lifting.patch_sigma)
         count = int(fitting.sum())
         T[:3, 3] *= unit
     if T is None or count < MIN_SHARE * len(way.points):
