@@ -234,7 +234,7 @@ def _demo_net() -> Config:
             "reconstruction.method": "demo_net",
             "lifting.scale_sigma": 0.12,
             "lifting.warp_sigma": 0.15,
-            "lifting.patch_sigma": 0.2,
+            "lifting.patch_sigma": 0.3,
             "lifting.common_scale_sigma": 0.08,
             "lifting.sigma_inflation": 2.2,
             "lifting.noise_linear": 0.1,

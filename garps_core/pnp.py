@@ -8,7 +8,8 @@ out, and are added through their effect on the pose (`systematic.py`).
 
 What depth errors do to a pixel lies along its epipolar line. Where a network's depth is off from place to place
 (`lifting.patch_sigma`), residuals along it count for less, down to the epipolar error alone, and the pose from
-bearings (`bearings.py`) is one more to begin with.
+bearings (`bearings.py`) is one more to begin with. Each match's depth is an unknown then, with the measured one as its
+prior: derivatives at the measured depths, which are off, would draw the translation to zero.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ MIN_PIXEL_SIGMA = 0.3
 HUBER = 2.0
 """Residuals beyond this many sigmas count with their length, not its square."""
 REFINEMENT_STEPS = 8
+FARTHEST = 3.0
+"""Sigmas of its measurement within which a match's depth is looked for."""
+DEPTH_STEPS = 3
+"""Of each match's depth, to where depth and pixels together put it under a pose."""
 PATCH_AVERAGE = 3.0
 """The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
 
@@ -96,17 +101,45 @@ def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 
 
     Where depth is off by `patch_sigma` from place to place, so many sigmas of that and of one pixel are allowed.
     """
-    moved = transform(T, way.points)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = project(way.K, moved) - way.px
-        sigmas = whitened(error, by_depth(way, T, moved), 1.0, patch_sigma)
-    return np.asarray((moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
+        seen = seen_at_likely_depths(way, T, 1.0, np.full(len(way.points), patch_sigma))
+        sigmas = whitened(seen.residual, seen.along, 1.0, patch_sigma)
+    return np.asarray((seen.moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
 
 
-def by_depth(way: OneWay, T: Array, moved: Array) -> Array:
-    """(n, 2) pixels per unit of relative error in the depth of the way's points, which T has moved."""
-    turned = (T[:3, :3] @ way.points.T).T
-    return np.asarray((_by_point(way.K, moved) @ turned[..., None])[..., 0])
+@dataclass(frozen=True)
+class Seen:
+    """A way's points under a pose, each at the depth where its measurement and the pixel together put it."""
+
+    points: Array
+    """(n, 3) m, in the camera that measured them."""
+    moved: Array
+    """(n, 3) m, in the camera that saw the pixels."""
+    along: Array
+    """(n, 2) px by which a point moves in the image per unit of the logarithm of its depth."""
+    residual: Array
+    """(n, 2) px, at the measured depth, by the derivative at the likely one."""
+
+
+def seen_at_likely_depths(way: OneWay, T: Array, pixel_sigma: float, relative: Array) -> Seen:
+    """The way under T where depth is off by `relative` (n,), sigmas of its logarithm; zeros leave it as measured."""
+    change = np.zeros(len(way.points))
+    for step in range(DEPTH_STEPS + 1):
+        points = way.points * np.exp(change)[:, None]
+        moved = transform(T, points)
+        along = by_depth(points, T, way.K)
+        residual = project(way.K, moved) - way.px - along * change[:, None]
+        if step == DEPTH_STEPS or not relative.any():
+            break
+        gain = relative**2 / (pixel_sigma**2 + relative**2 * np.square(along).sum(1))
+        change = np.clip(-gain * (along * residual).sum(1), -FARTHEST * relative, FARTHEST * relative)
+    return Seen(points, moved, along, residual)
+
+
+def by_depth(points: Array, T: Array, K: Array) -> Array:
+    """(n, 2) px by which points (n, 3) m, moved by T, move in an image per unit of the logarithm of their depth."""
+    turned = (T[:3, :3] @ points.T).T
+    return np.asarray((_by_point(K, transform(T, points)) @ turned[..., None])[..., 0])
 
 
 def _by_point(K: Array, moved: Array) -> Array:
@@ -164,19 +197,18 @@ class Normal:
 
 def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
     """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
-    moved = transform(T, way.points)
-    residual = project(way.K, moved) - way.px
-    D = _by_point(way.K, moved)
-    J = D @ point_jacobian(moved)
-    along = by_depth(way, T, moved)
     sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / PATCH_AVERAGE
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
+    seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
+    residual, along = seen.residual, seen.along
+    D = _by_point(way.K, seen.moved)
+    J = D @ point_jacobian(seen.moved)
     C = pixel_sigma**2 * np.eye(2) + along[:, :, None] * along[:, None, :] * relative[:, None, None] ** 2
     W = np.linalg.inv(C)
     size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
     W = W * np.minimum(1.0, HUBER / size)[:, None, None]
     JW = J.transpose(0, 2, 1) @ W
-    fields = D @ (T[:3, :3] @ shared_errors(way.points))
+    fields = D @ (T[:3, :3] @ shared_errors(seen.points))
     pointing = np.zeros((2, 8))
     pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
     scores = (JW @ residual[..., None])[..., 0]

@@ -5,46 +5,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surfaces import FREE, TRUTH, disturbed, flat, grey_at, look, room
+from made_matches import BLANK, exact_matches, pose_from
+from surfaces import FREE, TRUTH, disturbed, room
 
 from garps_core import Config, Prior, Status, View, estimate_relative_pose
 from garps_core.config import Start
 from garps_core.errors import InitialisationError
-from garps_core.features import Matches, match_features
-from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
+from garps_core.features import match_features
+from garps_core.geometry import project, se3_exp, se3_inverse, se3_log, transform
 from garps_core.initialise import combined, initialise
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import PATCH_AVERAGE, pose_from_matches
+from garps_core.pnp import PATCH_AVERAGE
 from garps_core.uncertainty import inverted, twist_from_ros
 
 FEATURES = Config().replace({"start.method": "features"})
 STRICT = Config().replace({"start.identity_fallback": False})
-HD = (240, 320)
-CAMERA = np.array([[280.0, 0, 159.5], [0, 280.0, 119.5], [0, 0, 1]])
 APART = (
     se3_exp(np.array([0, 0, 3.5, 0, 0, 0]))
     @ se3_exp(np.array([0, 0, 0, 0.1, 0.7, 0]))
     @ se3_exp(np.array([0, 0, -3.5, 0, 0, 0]))
 )  # turned about a point in the scene, so that position and rotation go together
-BLANK = look(surface=flat, colours=grey_at, camera=CAMERA, size=HD)
-
-
-def exact_matches(seed=0, count=80, pixel_noise=0.0, outliers=0, relative_depth_noise=0.0, truth=TRUTH):
-    """Points 2 to 5 m away, matched between two cameras without an image."""
-    rng = np.random.default_rng(seed)
-    px_s = rng.uniform((40, 30), (280, 210), (count, 2))
-    points = pixel_rays(CAMERA, px_s[:, 0], px_s[:, 1]) * rng.uniform(2, 5, (count, 1))
-    there = transform(truth, points)
-    px_t = project(CAMERA, there)
-    px_t[:outliers] = rng.uniform((0, 0), (319, 239), (outliers, 2))
-    there[:outliers] = pixel_rays(CAMERA, *px_t[:outliers].T) * rng.uniform(2, 5, (outliers, 1))
-    gains = 1 + relative_depth_noise * rng.normal(size=(2, count, 1))
-    shift = pixel_noise * rng.normal(size=(2, count, 2))
-    return Matches(px_s + shift[0], px_t + shift[1], points * gains[0], there * gains[1])
-
-
-def pose_from(matches, config=None):
-    return pose_from_matches(matches, BLANK, BLANK, config or Config())
 
 
 @pytest.mark.parametrize(("seed", "level"), [(1, 1), (1, 2), (2, 1), (2, 2)])

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth that is off from place to place: what features still know then, and how sure they may be of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_matches import BLANK, CAMERA, exact_matches, pose_from
+from surfaces import TRUTH
+
+from garps_core import Config
+from garps_core.bearings import MIN_LENGTHS, pose_from_bearings, triangulated
+from garps_core.errors import InitialisationError
+from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, transform
+from garps_core.metrics import nees, rotation_error_deg, translation_error_m
+from garps_core.pnp import PATCH_AVERAGE, OneWay, by_depth, inliers_of, pose_from_matches, whitened
+
+ASIDE = se3_exp(np.array([0.5, -0.1, 0.1, 0.03, 0.2, -0.02]))
+"""Half a metre apart: 20 % of the depth is 10 px and more."""
+OFF = 0.2
+TURNED = se3_exp(np.array([0, 0, 0, 0.05, 0.2, 0.03]))
+
+
+def settings(patch_sigma: float, **others: float) -> Config:
+    """Of a depth that is right but for errors from place to place, which it tells."""
+    nothing_else = {"noise_floor_m": 0.0, "noise_linear": 0.0, "scale_sigma": 0.0, "warp_sigma": 0.0}
+    lifting = {f"lifting.{name}": value for name, value in (nothing_else | {"patch_sigma": patch_sigma}).items()}
+    return Config().replace(lifting | {"lifting.pointing_sigma_rad": 0.0, "start.covariance_inflation": 1.0, **others})
+
+
+def bearings(matches, config=None):
+    return pose_from_bearings(matches, CAMERA, CAMERA, config or settings(OFF))
+
+
+def rotation_errors(patch_sigma: float, noise: float, seeds=range(20)) -> float:
+    errors = []
+    for seed in seeds:
+        matches = exact_matches(seed, pixel_noise=0.5, relative_depth_noise=noise, truth=ASIDE)
+        try:
+            errors.append(rotation_error_deg(pose_from(matches, settings(patch_sigma)).T_target_source, ASIDE))
+        except InitialisationError:
+            errors.append(np.inf)
+    return float(np.median(errors))
+
+
+@pytest.mark.parametrize("truth", [TRUTH, ASIDE, se3_inverse(ASIDE)], ids=["near", "aside", "back"])
+def test_exact_matches_give_the_exact_pose_with_its_length(truth):
+    np.testing.assert_allclose(bearings(exact_matches(truth=truth)), truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("known", ["both", "source", "target"])
+def test_depth_gives_the_length_and_nothing_else(known):
+    matches = exact_matches(truth=ASIDE)
+    larger = {"source_points": 1.2 * matches.source_points, "target_points": 1.2 * matches.target_points}
+    for side in ("source", "target"):
+        if known not in ("both", side):
+            larger[f"{side}_points"] = np.full_like(matches.source_points, np.nan)
+    expected = ASIDE.copy()
+    expected[:3, 3] *= 1.2
+    np.testing.assert_allclose(bearings(replace(matches, **larger)), expected, atol=1e-6)
+
+
+def test_a_few_wild_depths_do_not_change_the_length():
+    matches = exact_matches(truth=ASIDE)
+    wild = matches.source_points.copy()
+    wild[:20] *= np.linspace(0.1, 9, 20)[:, None]
+    np.testing.assert_allclose(bearings(replace(matches, source_points=wild)), ASIDE, atol=1e-6)
+
+
+def test_what_cannot_be_told_is_none():
+    matches = exact_matches(truth=ASIDE)
+    few = settings(OFF, **{"start.min_inliers": 90})
+    unknown, three = np.full_like(matches.source_points, np.nan), matches.source_points.copy()
+    three[MIN_LENGTHS - 1 :] = np.nan
+    assert bearings(exact_matches(count=0)) is None and bearings(exact_matches(count=4)) is None
+    assert bearings(matches, few) is None
+    assert bearings(replace(matches, source_points=unknown, target_points=unknown)) is None
+    assert bearings(replace(matches, source_points=three, target_points=unknown)) is None
+    assert bearings(exact_matches(count=40, outliers=40), settings(OFF, **{"start.min_inliers": 15})) is None
+
+
+def test_triangulation_gives_the_depths_of_both_views():
+    matches = exact_matches(truth=ASIDE)
+    rays = [pixel_rays(CAMERA, *px.T) for px in (matches.source_px, matches.target_px)]
+    depths = triangulated(ASIDE, *rays)
+    np.testing.assert_allclose(depths, np.stack([matches.source_points[:, 2], matches.target_points[:, 2]], axis=1))
+
+
+def test_along_is_what_a_longer_ray_does_to_the_pixel():
+    matches, gain = exact_matches(truth=ASIDE), 1e-6
+    way = OneWay(matches.source_points, matches.target_px, CAMERA)
+    shifts = project(CAMERA, transform(ASIDE, way.points * (1 + gain))) - way.px
+    np.testing.assert_allclose(by_depth(way.points, ASIDE, CAMERA), shifts / gain, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("pixel_sigma", "patch_sigma"), [(1.0, 0.2), (0.5, 0.05), (2.0, 0.0)])
+def test_whitened_noise_is_that_of_pixels(pixel_sigma, patch_sigma):
+    """M (s^2 1 + p^2 a a') M' = s^2 1, for the matrix M that whitens."""
+    for along in np.array([[30.0, 0.0], [-7.0, 11.0], [0.0, 0.0]]):
+        whitening = np.stack([whitened(e[None], along[None], pixel_sigma, patch_sigma)[0] for e in np.eye(2)], axis=1)
+        noise = pixel_sigma**2 * np.eye(2) + patch_sigma**2 * np.outer(along, along)
+        np.testing.assert_allclose(whitening @ noise @ whitening.T, pixel_sigma**2 * np.eye(2), atol=1e-12)
+
+
+def test_what_depth_explains_is_allowed_and_nothing_else():
+    """10 px off along the epipolar line, then 10 px off across it."""
+    matches = exact_matches(truth=ASIDE)
+    along = by_depth(matches.source_points, ASIDE, CAMERA)
+    unit = along / np.linalg.norm(along, axis=1, keepdims=True)
+    moved = [OneWay(matches.source_points, matches.target_px + 10 * side, CAMERA) for side in (unit, unit[:, ::-1])]
+    moved[1] = OneWay(matches.source_points, matches.target_px + 10 * unit[:, ::-1] * [1, -1], CAMERA)
+    assert inliers_of(moved[0], ASIDE, 3.0, OFF).mean() > 0.95 and not inliers_of(moved[1], ASIDE, 3.0, OFF).any()
+    assert not inliers_of(moved[0], ASIDE, 3.0).any()
+
+
+def test_rotation_is_kept_where_depth_is_off_from_place_to_place():
+    told, untold = rotation_errors(OFF, OFF), rotation_errors(0.0, OFF)
+    assert told < 0.5 and told < untold / 2
+
+
+def test_nothing_is_lost_where_depth_is_right():
+    """A twentieth of the depth's error costs nothing that counts: epipolar lines carry most of the pose."""
+    assert rotation_errors(0.03, 0.01) < 1.3 * rotation_errors(0.0, 0.01)
+
+
+@pytest.mark.parametrize("truth", [ASIDE, TRUTH], ids=["aside", "near"])
+def test_the_covariance_covers_the_errors(truth):
+    values = []
+    for seed in range(40):
+        matches = exact_matches(seed, pixel_noise=0.5, relative_depth_noise=OFF / 2, truth=truth)
+        start = pose_from(matches, settings(OFF / 2))
+        values.append(nees(start.T_target_source, start.covariance, truth))
+    assert 1.8 < np.mean(values) < 9, "6, or 3 where matches that count both ways are independent"
+
+
+def test_wrong_matches_are_left_out():
+    matches = exact_matches(3, count=120, pixel_noise=0.5, outliers=50, relative_depth_noise=OFF, truth=ASIDE)
+    start = pose_from(matches, settings(OFF, **{"start.min_inliers": 15}))
+    assert (
+        rotation_error_deg(start.T_target_source, ASIDE) < 1 and translation_error_m(start.T_target_source, ASIDE) < 0.1
+    )
+
+
+def test_cameras_that_only_turn_are_seen_not_to_move():
+    """Then depth does not matter at all, and the direction of t that bearings give means nothing."""
+    start = pose_from(exact_matches(pixel_noise=0.3, relative_depth_noise=OFF, truth=TURNED), settings(OFF))
+    assert translation_error_m(start.T_target_source, TURNED) < 0.02
+    assert rotation_error_deg(start.T_target_source, TURNED) < 0.3
+    assert np.sqrt(np.diag(start.covariance)[:3]).max() < 0.02
+
+
+def test_swapped_views_give_the_inverse():
+    there = exact_matches(2, pixel_noise=0.5, relative_depth_noise=OFF, truth=ASIDE)
+    back = replace(
+        there,
+        source_px=there.target_px, target_px=there.source_px,
+        source_points=there.target_points, target_points=there.source_points,
+    )  # fmt: skip
+    one, other = (pose_from(matches, settings(OFF)).T_target_source for matches in (there, back))
+    assert translation_error_m(se3_inverse(other), one) < 0.01 and rotation_error_deg(se3_inverse(other), one) < 0.1
+
+
+@pytest.mark.parametrize("preset", ["monocular", "demo_net"])
+def test_presets_of_one_image_allow_for_it_and_ask_for_more_matches(preset):
+    config, sensor = Config.preset(preset), Config()
+    assert config.lifting.patch_sigma >= 0.03 and sensor.lifting.patch_sigma == 0
+    assert config.start.min_inliers > sensor.start.min_inliers
+    matches = exact_matches(count=config.start.min_inliers - 1)
+    with pytest.raises(InitialisationError, match=r"\d+ feature matches"):
+        pose_from_matches(matches, BLANK, BLANK, config)
+
+
+def test_noise_of_single_readings_is_another_thing():
+    """`lifting.noise_linear` averages out over a patch; what a patch has in common does not."""
+    matches = exact_matches(truth=ASIDE, pixel_noise=0.5)
+    noisy = settings(0.0).replace({"lifting.noise_linear": OFF * PATCH_AVERAGE})
+    a, b = pose_from(matches, noisy), pose_from(matches, settings(OFF))
+    np.testing.assert_allclose(np.sqrt(np.diag(b.covariance)), np.sqrt(np.diag(a.covariance)), rtol=0.5)
