@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from surfaces import TRUTH, K, flat, grey_at, look, off, room
@@ -93,6 +94,41 @@ def test_depth_that_is_off_by_four_per_cent_costs_the_parallax_only(scene, wrong
     metres, radians = off(found.T, truth)
     parallax = np.linalg.norm(truth[:3, 3])
     assert metres < 0.04 * parallax and np.degrees(radians) < 0.06
+
+
+def off_in_patches(view, seed, size=12, share=0.1):
+    """The view with its depth off by so much from place to place; each place is some cells of its grid."""
+    rng, (height, width) = np.random.default_rng(seed), view.depth.shape
+    coarse = rng.normal(size=(height // size + 2, width // size + 2)).astype(np.float32)
+    gain = np.exp(share * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC))
+    return replace(view, depth=(view.depth * gain).astype(np.float32), patch_sigma=share)
+
+
+def test_depth_off_from_place_to_place_makes_less_of_brightness_along_epipolar_lines_only(views):
+    """Said of good depth: nothing changes but the weights. Across the lines depth has no say."""
+    x, y = (photometric.grid_of(view, 1) for view in views)
+    x_told = replace(x, patch_sigma=0.2)
+    away = TRUTH.copy()
+    away[:3, 3] = [0.4, 0.0, 0.0]  # epipolar lines along x
+    plain, careful = photometric._compared(x, y, away), photometric._compared(x_told, y, away)
+    ratio = np.diag(careful.information) / np.diag(plain.information)
+    assert ratio[0] < 0.75 * ratio[1] and (ratio < 1).all()
+    still = np.eye(4)  # without parallax depth does not matter at all
+    still[:3, :3] = TRUTH[:3, :3]
+    plain, careful = photometric._compared(x, y, still), photometric._compared(x_told, y, still)
+    np.testing.assert_array_equal(careful.information, plain.information)
+
+
+def test_poses_are_better_where_it_is_told_that_depth_is_off(views):
+    errors = {True: [], False: []}
+    for seed in range(6):
+        wrong = [off_in_patches(view, [seed, k]) for k, view in enumerate(views)]
+        for told in errors:
+            cameras = wrong if told else [replace(view, patch_sigma=0.0) for view in wrong]
+            found = sharpened(*cameras, se3_exp(STARTS[0]) @ TRUTH)
+            errors[told].append(off(found.T, TRUTH))
+    for axis in (0, 1):
+        assert np.median([e[axis] for e in errors[True]]) < 0.9 * np.median([e[axis] for e in errors[False]])
 
 
 def test_depth_of_both_views_in_another_unit_scales_the_translation(views):
