@@ -19,7 +19,8 @@ from garps_core.checks import Float32Array
 from garps_core.config import Config
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, transform
-from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, OneWay, inliers_of, keep, normal_equations, ransac
+from garps_core.match_depth import OneWay
+from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, inliers_of, keep, normal_equations, ransac
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
 from garps_core.systematic import shared_sigmas
 from garps_core.types import Prior, View

@@ -8,8 +8,7 @@ out, and are added through their effect on the pose (`systematic.py`).
 
 What depth errors do to a pixel lies along its epipolar line. Where a network's depth is off from place to place
 (`lifting.patch_sigma`), residuals along it count for less, down to the epipolar error alone, and the pose from
-bearings (`bearings.py`) is one more to begin with. Each match's depth is an unknown then, with the measured one as its
-prior: derivatives at the measured depths, which are off, would draw the translation to zero.
+bearings (`bearings.py`) is one more to begin with. Each match's depth is an unknown then (`match_depth.py`).
 """
 
 from __future__ import annotations
@@ -24,8 +23,9 @@ from garps_core.bearings import pinhole, pose_from_bearings
 from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
-from garps_core.geometry import Array, adjoint, point_jacobian, project, se3_exp, se3_inverse, transform
+from garps_core.geometry import Array, adjoint, point_jacobian, se3_exp, se3_inverse
 from garps_core.lift import depth_sigma
+from garps_core.match_depth import OneWay, by_point, seen_at_likely_depths, whitened
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
@@ -35,23 +35,10 @@ MIN_PIXEL_SIGMA = 0.3
 HUBER = 2.0
 """Residuals beyond this many sigmas count with their length, not its square."""
 REFINEMENT_STEPS = 8
-FARTHEST = 3.0
-"""Sigmas of its measurement within which a match's depth is looked for."""
-DEPTH_STEPS = 3
-"""Of each match's depth, to where depth and pixels together put it under a pose."""
 PATCH_AVERAGE = 3.0
 """The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
 
 Bool = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class OneWay:
-    """3D points (n, 3) m of one view and where the other view, with intrinsics K, saw them: px (n, 2)."""
-
-    points: Array
-    px: Array
-    K: Array
 
 
 def pose_from_matches(matches: Matches, source: View, target: View, config: Config, origin: str = "features") -> Prior:
@@ -107,63 +94,6 @@ def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 
     return np.asarray((seen.moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A way's points under a pose, each at the depth where its measurement and the pixel together put it."""
-
-    points: Array
-    """(n, 3) m, in the camera that measured them."""
-    moved: Array
-    """(n, 3) m, in the camera that saw the pixels."""
-    along: Array
-    """(n, 2) px by which a point moves in the image per unit of the logarithm of its depth."""
-    residual: Array
-    """(n, 2) px, at the measured depth, by the derivative at the likely one."""
-
-
-def seen_at_likely_depths(way: OneWay, T: Array, pixel_sigma: float, relative: Array) -> Seen:
-    """The way under T where depth is off by `relative` (n,), sigmas of its logarithm; zeros leave it as measured."""
-    change = np.zeros(len(way.points))
-    for step in range(DEPTH_STEPS + 1):
-        points = way.points * np.exp(change)[:, None]
-        moved = transform(T, points)
-        along = by_depth(points, T, way.K)
-        residual = project(way.K, moved) - way.px - along * change[:, None]
-        if step == DEPTH_STEPS or not relative.any():
-            break
-        gain = relative**2 / (pixel_sigma**2 + relative**2 * np.square(along).sum(1))
-        change = np.clip(-gain * (along * residual).sum(1), -FARTHEST * relative, FARTHEST * relative)
-    return Seen(points, moved, along, residual)
-
-
-def by_depth(points: Array, T: Array, K: Array) -> Array:
-    """(n, 2) px by which points (n, 3) m, moved by T, move in an image per unit of the logarithm of their depth."""
-    turned = (T[:3, :3] @ points.T).T
-    return np.asarray((_by_point(K, transform(T, points)) @ turned[..., None])[..., 0])
-
-
-def _by_point(K: Array, moved: Array) -> Array:
-    """(n, 2, 3) pixels per metre that a point in front of the seeing camera moves."""
-    x, y, z = moved.T
-    D = np.zeros((len(z), 2, 3))
-    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * x / z**2
-    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * y / z**2
-    return D
-
-
-def whitened(residual: Array, along: Array, pixel_sigma: float, patch_sigma: float) -> Array:
-    """Residuals (n, 2) px, but in units of what depth errors add where they show: `along`, pixels per unit of them.
-
-    A residual of pixel noise with the covariance s^2 1 + p^2 a a' becomes one with s^2 1.
-    """
-    if patch_sigma == 0:
-        return residual
-    length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    direction = along / length
-    share = pixel_sigma / np.hypot(pixel_sigma, patch_sigma * length)
-    return np.asarray(residual - direction * (residual * direction).sum(1, keepdims=True) * (1 - share))
-
-
 def keep(way: OneWay, mask: Bool) -> OneWay:
     """The matches where mask is true."""
     return OneWay(way.points[mask], way.px[mask], way.K)
@@ -201,7 +131,7 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
     seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
     residual, along = seen.residual, seen.along
-    D = _by_point(way.K, seen.moved)
+    D = by_point(seen.moved, way.K)
     J = D @ point_jacobian(seen.moved)
     C = pixel_sigma**2 * np.eye(2) + along[:, :, None] * along[:, None, :] * relative[:, None, None] ** 2
     W = np.linalg.inv(C)

@@ -12,8 +12,9 @@ from garps_core import Config
 from garps_core.bearings import MIN_LENGTHS, pose_from_bearings, triangulated
 from garps_core.errors import InitialisationError
 from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
+from garps_core.match_depth import OneWay, by_depth, seen_at_likely_depths, whitened
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import PATCH_AVERAGE, OneWay, by_depth, inliers_of, pose_from_matches, whitened
+from garps_core.pnp import PATCH_AVERAGE, inliers_of, pose_from_matches
 
 ASIDE = se3_exp(np.array([0.5, -0.1, 0.1, 0.03, 0.2, -0.02]))
 """Half a metre apart: 20 % of the depth is 10 px and more."""
@@ -91,6 +92,20 @@ def test_along_is_what_a_longer_ray_does_to_the_pixel():
     way = OneWay(matches.source_points, matches.target_px, CAMERA)
     shifts = project(CAMERA, transform(ASIDE, way.points * (1 + gain))) - way.px
     np.testing.assert_allclose(by_depth(way.points, ASIDE, CAMERA), shifts / gain, rtol=1e-3, atol=1e-3)
+
+
+def test_the_likely_depth_is_where_both_costs_are_smallest():
+    """Against a fine grid of depths, match by match."""
+    matches = exact_matches(5, count=20, pixel_noise=2.0, relative_depth_noise=OFF, truth=ASIDE)
+    way, s = OneWay(matches.source_points, matches.target_px, CAMERA), 1.5
+    seen = seen_at_likely_depths(way, ASIDE, s, np.full(20, OFF))
+    found = np.log(seen.points[:, 2] / way.points[:, 2])
+    tried = np.linspace(-3 * OFF, 3 * OFF, 4001)
+    pixels = np.stack([project(CAMERA, transform(ASIDE, way.points * np.exp(d))) for d in tried])
+    cost = np.square(pixels - way.px).sum(-1) / s**2 + np.square(tried / OFF)[:, None]
+    np.testing.assert_allclose(found, tried[cost.argmin(0)], atol=0.02)
+    as_measured = seen_at_likely_depths(way, ASIDE, s, np.zeros(20))
+    np.testing.assert_array_equal(as_measured.points, way.points)
 
 
 @pytest.mark.parametrize(("pixel_sigma", "patch_sigma"), [(1.0, 0.2), (0.5, 0.05), (2.0, 0.0)])
