@@ -87,6 +87,7 @@ VARIANTS: dict[str, Variant] = {
     "garps-no-ray-uncertainty": Variant(
         "depth without noise", {"lifting.noise_floor_m": 5e-4, "lifting.noise_linear": 0.0}
     ),
+    "garps-no-patches": Variant("depth that is off only as a whole", {"lifting.patch_sigma": 0.0}),
     GARPS_PAPER: Variant("the paper's settings, from the same start", settings=as_published, same_start=True),
     "garps-no-depth-errors": Variant("depth maps' own errors are not solved for", {"alignment.depth_errors": False}),
 }
