@@ -14,7 +14,9 @@ from garps_core.config import Config
 from garps_core.features import Matches
 from garps_core.geometry import Array, pixel_rays
 
-SHARE = 1 / 3
+MOST_TRIALS = 10_000
+"""Of RANSAC: more costs a second where most matches are wrong."""
+EPIPOLAR_SHARE = 1 / 3
 """Of `start.ransac_px`, a match's distance from its epipolar line: without depth in it, it is that much smaller."""
 MIN_LENGTHS = 4
 """Depths that agree with the directions' triangulation; fewer say no length."""
@@ -27,8 +29,9 @@ def pose_from_bearings(matches: Matches, K_source: Array, K_target: Array, confi
     """
     if len(matches) < max(5, config.start.min_inliers):
         return None
-    px = SHARE * config.start.ransac_px
-    options = {"max_epipolar_error": px, "max_error": px, "seed": config.seed}
+    px = EPIPOLAR_SHARE * config.start.ransac_px
+    trials = {"max_iterations": MOST_TRIALS, "seed": config.seed}
+    options = {"max_epipolar_error": px, "max_error": px, **trials}
     cameras = [pinhole(K_source), pinhole(K_target)]
     pose, info = poselib.estimate_relative_pose(matches.source_px, matches.target_px, *cameras, options, {})
     T, inlier = np.eye(4), np.asarray(info["inliers"], bool)

@@ -85,7 +85,7 @@ def _by_network(source: View, target: View, config: Config) -> Prior:
         errors = {"scale_sigma": np.sqrt(2) * config.start.network_scale_sigma}
         errors["warp_sigma"] = config.start.network_warp_sigma
         wider = {f"lifting.{name}": max(float(e), getattr(config.lifting, name)) for name, e in errors.items()}
-        config = config.replace(wider)
+        config = config.replace(wider | {"lifting.patch_sigma": 0.0})  # these points were seen with both views
     return pose_from_matches(matches, source, target, config, maps.origin)
 
 

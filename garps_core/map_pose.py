@@ -139,7 +139,7 @@ def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
     T = ransac(of_one, THRESHOLD_PX, config, MIN_TRIALS)
     count = 0
     if T is not None:
-        fitting = inliers_of(of_one, T, THRESHOLD_PX, config.lifting.patch_sigma)
+        fitting = inliers_of(of_one, T, THRESHOLD_PX)
         count = int(fitting.sum())
         T[:3, 3] *= unit
     if T is None or count < MIN_SHARE * len(way.points):
@@ -204,12 +204,13 @@ def _refined(T: Array, way: OneWay, scale_sigma: float, config: Config) -> tuple
     sigma, shared = 1.0, shared_sigmas(config.lifting)
     shared[0] = scale_sigma
     shared[1:6] = np.maximum(shared[1:6], config.start.network_warp_sigma)
+    lifting = replace(config.lifting, patch_sigma=0.0)  # that of another depth: these points were seen with both views
     for _ in range(REFINEMENT_STEPS):
-        normal = normal_equations(way, T, sigma, config.lifting)
+        normal = normal_equations(way, T, sigma, lifting)
         step = -np.linalg.solve(normal.H + 1e-9 * np.eye(6), normal.b)
         T = se3_exp(np.asarray(step, np.float64)) @ T
         sigma = max(1.4826 * float(np.median(np.abs(normal.residual_px))), MIN_PIXEL_SIGMA)
-    normal = normal_equations(way, T, sigma, config.lifting)
+    normal = normal_equations(way, T, sigma, lifting)
     inverse = np.linalg.inv(normal.H + 1e-9 * np.eye(6))
     alike = max(1.0, float(np.trace(_spread(normal, way.px) @ inverse)) / 6)  # 1 for pixels that err by themselves
     effect = inverse @ normal.from_points * shared

@@ -21,6 +21,8 @@ from garps_core.geometry import Array, project, transform
 
 STEPS = 3
 """Of each match's depth under one pose."""
+NO_PARALLAX = 1e-6
+"""Pixels per unit of the logarithm of the depth below which an epipolar line has no direction."""
 FARTHEST = 3.0
 """Sigmas of its measurement within which a match's depth is looked for."""
 
@@ -83,11 +85,22 @@ def by_point(points: Array, K: Array) -> Array:
     return D
 
 
-def whitened(residual: Array, along: Array, pixel_sigma: float, depth_sigma: float) -> Array:
-    """Residuals (n, 2) px with the covariance s^2 1 + p^2 a a' -> with s^2 1: less of what lies along a (n, 2)."""
+def whitened(seen: Seen, pixel_sigma: float, depth_sigma: float) -> Array:
+    """Residuals (n, 2) px with the covariance s^2 1 + p^2 a a' -> with s^2 1: less of what lies along a."""
     if depth_sigma == 0:
-        return residual
-    length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    direction = along / length
+        return seen.residual
+    direction, length = _directions(seen.along)
     share = pixel_sigma / np.hypot(pixel_sigma, depth_sigma * length)
-    return np.asarray(residual - direction * (residual * direction).sum(1, keepdims=True) * (1 - share))
+    return np.asarray(seen.residual - direction * (seen.residual * direction).sum(1, keepdims=True) * (1 - share))
+
+
+def across(seen: Seen) -> Array:
+    """(n,) px, residuals across the epipolar lines: what no depth explains."""
+    direction, _ = _directions(seen.along)
+    return np.asarray(seen.residual[:, 1] * direction[:, 0] - seen.residual[:, 0] * direction[:, 1])
+
+
+def _directions(along: Array) -> tuple[Array, Array]:
+    """Unit vectors (n, 2), any where there is no parallax, and lengths (n, 1) px."""
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    return np.where(length > NO_PARALLAX, along / np.maximum(length, NO_PARALLAX), [1.0, 0.0]), length

@@ -19,13 +19,13 @@ import numpy as np
 import numpy.typing as npt
 import poselib
 
-from garps_core.bearings import pinhole, pose_from_bearings
+from garps_core.bearings import MOST_TRIALS, pinhole, pose_from_bearings
 from garps_core.config import Config, Lifting
 from garps_core.errors import InitialisationError
 from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, point_jacobian, se3_exp, se3_inverse
 from garps_core.lift import depth_sigma
-from garps_core.match_depth import OneWay, by_point, seen_at_likely_depths, whitened
+from garps_core.match_depth import OneWay, across, by_point, seen_at_likely_depths, whitened
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
@@ -71,7 +71,7 @@ def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) 
     """Pose that maps way.points into the camera that saw way.px, after so many trials at least; None without any."""
     if len(way.points) < max(4, config.start.min_inliers):
         return None
-    trials = {"min_iterations": least, "max_iterations": 10_000, "seed": config.seed}
+    trials = {"min_iterations": least, "max_iterations": MOST_TRIALS, "seed": config.seed}
     options = {"max_reproj_error": threshold_px, **trials}
     pose, info = poselib.estimate_absolute_pose(way.px, way.points, pinhole(way.K), options, {})
     T = np.eye(4)
@@ -90,7 +90,7 @@ def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = seen_at_likely_depths(way, T, 1.0, np.full(len(way.points), patch_sigma))
-        sigmas = whitened(seen.residual, seen.along, 1.0, patch_sigma)
+        sigmas = whitened(seen, 1.0, patch_sigma)
     return np.asarray((seen.moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
 
 
@@ -112,7 +112,7 @@ class Normal:
     from_pixels: Array
     """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
     residual_px: Array
-    """(n, 2), `whitened`: their spread is that of pixels."""
+    """What tells the noise of pixels: (n, 2), or (n,) across epipolar lines where depth is off by more than noise."""
 
     @property
     def H(self) -> Array:
@@ -142,8 +142,8 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     pointing = np.zeros((2, 8))
     pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
     scores = (JW @ residual[..., None])[..., 0]
-    left = whitened(residual, along, pixel_sigma, lifting.patch_sigma)
-    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, left)
+    of_pixels = across(seen) if lifting.patch_sigma > 0 else residual
+    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, of_pixels)
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
