@@ -70,6 +70,7 @@ SPACES: dict[str, dict[str, tuple[float, float]]] = {
         "start.covariance_inflation": (1.5, 4.0),
         "lifting.scale_sigma": (0.01, 0.06),
         "lifting.warp_sigma": (0.01, 0.05),
+        "lifting.patch_sigma": (0.01, 0.1),
     },
     DEMO_NET: {
         "alignment.information": (0.03, 10.0),
@@ -79,6 +80,7 @@ SPACES: dict[str, dict[str, tuple[float, float]]] = {
         "lifting.scale_sigma": (0.03, 0.4),
         "lifting.common_scale_sigma": (0.02, 0.3),
         "lifting.warp_sigma": (0.03, 0.4),
+        "lifting.patch_sigma": (0.05, 0.6),
     },
 }
 """What is searched, all on a logarithmic scale: few settings, so that half of the pairs can decide about them."""

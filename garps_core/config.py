@@ -227,7 +227,7 @@ def _demo_net() -> Config:
     """Two images by the network in the package, a demonstration that knows generated rooms only.
 
     Its depth is off by 10 % in scale, half of that in both maps alike, and 15 % in shape (docs/demo_net.md), several
-    times what `monocular` takes for usual: mixtures count for less, features and brightness across epipolar lines only.
+    times what `monocular` takes for usual: mixtures count for less, features mostly across epipolar lines.
     """
     return _monocular().replace(
         {

@@ -8,7 +8,9 @@ the coarsest grid, so this comes after the mixtures are aligned, whose result is
     minimise  information / 2 * sum rho((I_y(pi(T p)) - gain I_x(p) - offset) / sigma)  +  r' Lambda r / 2
 
 Both directions count. Gain and offset absorb the exposure, sigma is the residuals' own spread, rho is Tukey's
-biweight. (Direct alignment as in Steinbruecker et al. 2011 and Kerl et al. 2013, between two whole views.)
+biweight. Where a view's depth is off from place to place (`Frustum.patch_sigma`), the brightness that this changes at a
+point is added to the variance of its residual. (Direct alignment as in Steinbruecker et al. 2011 and Kerl et al. 2013,
+between two whole views.)
 """
 
 from __future__ import annotations

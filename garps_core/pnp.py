@@ -35,7 +35,7 @@ MIN_PIXEL_SIGMA = 0.3
 HUBER = 2.0
 """Residuals beyond this many sigmas count with their length, not its square."""
 REFINEMENT_STEPS = 8
-PATCH_AVERAGE = 3.0
+READINGS_AVERAGE = 3.0
 """The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
 
 Bool = npt.NDArray[np.bool_]
@@ -127,7 +127,7 @@ class Normal:
 
 def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
     """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
-    sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / PATCH_AVERAGE
+    sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / READINGS_AVERAGE
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
     seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
     residual, along = seen.residual, seen.along

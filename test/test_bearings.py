@@ -8,16 +8,17 @@ import pytest
 from made_matches import BLANK, CAMERA, exact_matches, pose_from
 from surfaces import TRUTH
 
-from garps_core import Config
+from garps_core import Config, pnp
 from garps_core.bearings import MIN_LENGTHS, pose_from_bearings, triangulated
 from garps_core.errors import InitialisationError
 from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
 from garps_core.match_depth import OneWay, Seen, across, by_depth, seen_at_likely_depths, whitened
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import PATCH_AVERAGE, inliers_of, pose_from_matches
+from garps_core.pnp import READINGS_AVERAGE, inliers_of, pose_from_matches
 
 ASIDE = se3_exp(np.array([0.5, -0.1, 0.1, 0.03, 0.2, -0.02]))
 """Half a metre apart: 20 % of the depth is 10 px and more."""
+AHEAD = se3_exp(np.array([0.05, 0.02, -0.5, 0.01, 0.02, 0.0]))
 OFF = 0.2
 TURNED = se3_exp(np.array([0, 0, 0, 0.05, 0.2, 0.03]))
 
@@ -94,17 +95,19 @@ def test_along_is_what_a_longer_ray_does_to_the_pixel():
     np.testing.assert_allclose(by_depth(way.points, ASIDE, CAMERA), shifts / gain, rtol=1e-3, atol=1e-3)
 
 
-def test_the_likely_depth_is_where_both_costs_are_smallest():
-    """Against a fine grid of depths, match by match."""
-    matches = exact_matches(5, count=20, pixel_noise=2.0, relative_depth_noise=OFF, truth=ASIDE)
-    way, s = OneWay(matches.source_points, matches.target_px, CAMERA), 1.5
-    seen = seen_at_likely_depths(way, ASIDE, s, np.full(20, OFF))
+@pytest.mark.parametrize("truth", [ASIDE, AHEAD], ids=["aside", "ahead"])
+def test_the_likely_depth_is_where_both_costs_are_smallest(truth):
+    """Against a fine grid of depths, match by match; never further from the measured one than three sigmas."""
+    matches = exact_matches(5, count=20, pixel_noise=2.0, relative_depth_noise=OFF, truth=truth)
+    points = matches.source_points * np.where(np.arange(20) == 7, 20.0, 1.0)[:, None]
+    way, s = OneWay(points, matches.target_px, CAMERA), 1.5
+    seen = seen_at_likely_depths(way, truth, s, np.full(20, OFF))
     found = np.log(seen.points[:, 2] / way.points[:, 2])
     tried = np.linspace(-3 * OFF, 3 * OFF, 4001)
-    pixels = np.stack([project(CAMERA, transform(ASIDE, way.points * np.exp(d))) for d in tried])
+    pixels = np.stack([project(CAMERA, transform(truth, way.points * np.exp(d))) for d in tried])
     cost = np.square(pixels - way.px).sum(-1) / s**2 + np.square(tried / OFF)[:, None]
     np.testing.assert_allclose(found, tried[cost.argmin(0)], atol=0.02)
-    as_measured = seen_at_likely_depths(way, ASIDE, s, np.zeros(20))
+    as_measured = seen_at_likely_depths(way, truth, s, np.zeros(20))
     np.testing.assert_array_equal(as_measured.points, way.points)
 
 
@@ -132,6 +135,18 @@ def test_what_depth_explains_is_allowed_and_nothing_else():
 def test_rotation_is_kept_where_depth_is_off_from_place_to_place():
     told, untold = rotation_errors(OFF, OFF), rotation_errors(0.0, OFF)
     assert told < 0.5 and told < untold / 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bearings_begin_where_more_matches_fit_than_from_pnp(monkeypatch, seed):
+    """50 right matches of 80, with depth off by a half."""
+    matches = exact_matches(seed, count=80, outliers=30, pixel_noise=0.3, relative_depth_noise=0.5, truth=ASIDE)
+    config = settings(0.4)
+    found = pose_from(matches, config)
+    monkeypatch.setattr(pnp, "pose_from_bearings", lambda *given: None)
+    inliers = [int(start.reason.split()[3]) for start in (found, pose_from(matches, config))]
+    assert inliers[0] >= 45 > inliers[1]
+    assert rotation_error_deg(found.T_target_source, ASIDE) < 0.3
 
 
 def test_nothing_is_lost_where_depth_is_right():
@@ -208,6 +223,6 @@ def test_presets_of_one_image_allow_for_it_and_ask_for_more_matches(preset):
 
 def test_noise_of_single_readings_is_averaged_over_their_patch_and_errors_of_places_are_not():
     matches = exact_matches(truth=ASIDE, pixel_noise=0.5)
-    noisy = settings(0.0).replace({"lifting.noise_linear": OFF * PATCH_AVERAGE})
+    noisy = settings(0.0).replace({"lifting.noise_linear": OFF * READINGS_AVERAGE})
     a, b = pose_from(matches, noisy), pose_from(matches, settings(OFF))
     np.testing.assert_allclose(np.sqrt(np.diag(b.covariance)), np.sqrt(np.diag(a.covariance)), rtol=0.5)

@@ -15,7 +15,7 @@ from garps_core.features import match_features
 from garps_core.geometry import project, se3_exp, se3_inverse, se3_log, transform
 from garps_core.initialise import combined, initialise
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import PATCH_AVERAGE
+from garps_core.pnp import READINGS_AVERAGE
 from garps_core.uncertainty import inverted, twist_from_ros
 
 FEATURES = Config().replace({"start.method": "features"})
@@ -90,7 +90,7 @@ def test_wrong_matches_are_left_out(outliers):
 @pytest.mark.parametrize("truth", [TRUTH, APART], ids=["beside", "two metres apart"])
 def test_covariance_of_the_start_covers_its_errors(truth):
     """Forty draws of pixel and depth noise, none of it shared; the points' noise is that of a patch's mean."""
-    own = {"lifting.noise_floor_m": 0.0, "lifting.noise_linear": 0.01 * PATCH_AVERAGE}
+    own = {"lifting.noise_floor_m": 0.0, "lifting.noise_linear": 0.01 * READINGS_AVERAGE}
     config = Config().replace({**own, "lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0})
     values = []
     for seed in range(40):

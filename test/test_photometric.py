@@ -80,6 +80,7 @@ def test_the_frustum_of_a_lifted_view_is_enough(preset, seed):
     source, target, truth = room(seed, 1)
     config = Config.preset(preset)
     cameras = [reconstruct(view, config).frustum for view in (source, target)]
+    assert all(camera.patch_sigma == config.lifting.patch_sigma for camera in cameras)
     found = sharpened(*cameras, se3_exp(STARTS[0]) @ truth, information=1.0)
     metres, radians = off(found.T, truth)
     assert metres < 0.005 and np.degrees(radians) < 0.1
