@@ -34,7 +34,7 @@ test: $(VENV)/.test
 bench: $(VENV)/.test
 	$(PY) -m bench.speed
 	$(PY) -m bench.run
-	$(PY) -m bench.run --methods ablations --depth monocular,demo_net --starts disturbed --limit 80 --out out/ablations
+	$(PY) -m bench.run --methods ablations --depth monocular,demo_net --starts disturbed --limit 40 --out out/ablations
 	$(PY) -m bench.live
 
 test-numpy1: $(VENV1)/.test
