@@ -44,6 +44,8 @@ class Seen:
     """(n, 3) m, in the camera that measured them."""
     moved: Array
     """(n, 3) m, in the camera that saw the pixels."""
+    by_point: Array
+    """(n, 2, 3) px per metre that a moved point moves there."""
     along: Array
     """(n, 2) px by which a point moves in the image per unit of the logarithm of its depth."""
     residual: Array
@@ -66,17 +68,13 @@ def seen_at_likely_depths(way: OneWay, T: Array, pixel_sigma: float, depth_sigma
 def _seen(way: OneWay, T: Array, change: Array) -> Seen:
     points = way.points * np.exp(change)[:, None]
     moved = transform(T, points)
-    along = by_depth(points, T, way.K)
-    return Seen(points, moved, along, project(way.K, moved) - way.px - along * change[:, None])
-
-
-def by_depth(points: Array, T: Array, K: Array) -> Array:
-    """(n, 2) px by which points (n, 3) m, moved by T, move in an image per unit of the logarithm of their depth."""
+    by_point = _by_point(moved, way.K)
     turned = (T[:3, :3] @ points.T).T
-    return np.asarray((by_point(transform(T, points), K) @ turned[..., None])[..., 0])
+    along = np.asarray((by_point @ turned[..., None])[..., 0])
+    return Seen(points, moved, by_point, along, project(way.K, moved) - way.px - along * change[:, None])
 
 
-def by_point(points: Array, K: Array) -> Array:
+def _by_point(points: Array, K: Array) -> Array:
     """(n, 2, 3) px per metre that points (n, 3) m move in front of the camera that sees them."""
     x, y, z = points.T
     D = np.zeros((len(z), 2, 3))

@@ -25,7 +25,7 @@ from garps_core.errors import InitialisationError
 from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, point_jacobian, se3_exp, se3_inverse
 from garps_core.lift import depth_sigma
-from garps_core.match_depth import OneWay, across, by_point, seen_at_likely_depths, whitened
+from garps_core.match_depth import OneWay, across, seen_at_likely_depths, whitened
 from garps_core.systematic import shared_errors, shared_sigmas
 from garps_core.types import Prior, View
 from garps_core.uncertainty import ros_from_twist
@@ -131,7 +131,7 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
     seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
     residual, along = seen.residual, seen.along
-    D = by_point(seen.moved, way.K)
+    D = seen.by_point
     J = D @ point_jacobian(seen.moved)
     C = pixel_sigma**2 * np.eye(2) + along[:, :, None] * along[:, None, :] * relative[:, None, None] ** 2
     W = np.linalg.inv(C)
