@@ -13,17 +13,19 @@ import torch
 
 from garps_core import paper, solve
 from garps_core.config import Alignment, Config
+from garps_core.depth_errors import DEPTH_MODES, shared_sigmas
+from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.geometry import Array
+from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.initialise import identity, initialise
-from garps_core.pairing import Cloud, checked_device, overlap, to_cloud
+from garps_core.pairing import Cloud, overlap, to_cloud
 from garps_core.photometric import sharpen
 from garps_core.reconstruct import depth_origin, mixtures_of, with_depth
 from garps_core.search import search
-from garps_core.solve import MIN_ROWS, Belief, Solution
-from garps_core.systematic import DEPTH_MODES, shared_sigmas
+from garps_core.solve import MIN_ROWS, Solution
+from garps_core.state import Belief
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.uncertainty import inflated, pose_covariance, ros_from_twist, share_of_known, twist_from_ros
+from garps_core.uncertainty import inflated, pose_covariance, share_of_known
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0

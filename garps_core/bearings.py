@@ -13,6 +13,9 @@ import poselib
 from garps_core.config import Config
 from garps_core.features import Matches
 from garps_core.geometry import Array, pixel_rays
+from garps_core.match_depth import (
+    OneWay,
+)
 
 MOST_TRIALS = 10_000
 """Of RANSAC: more costs a second where most matches are wrong."""
@@ -58,3 +61,15 @@ def pinhole(K: Array) -> dict[str, object]:
     """A camera for PoseLib; the size is of no use to it."""
     parameters = [K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}
+
+
+def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) -> Array | None:
+    """Pose that maps way.points into the camera that saw way.px, after so many trials at least; None without any."""
+    if len(way.points) < max(4, config.start.min_inliers):
+        return None
+    trials = {"min_iterations": least, "max_iterations": MOST_TRIALS, "seed": config.seed}
+    options = {"max_reproj_error": threshold_px, **trials}
+    pose, info = poselib.estimate_absolute_pose(way.px, way.points, pinhole(way.K), options, {})
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = pose.R, pose.t
+    return T if info["num_inliers"] >= 4 and np.isfinite(T).all() else None

@@ -13,7 +13,9 @@ from typing import Any
 from garps_core.alignment_settings import Alignment, Rung
 from garps_core.described import Checked, flattened, replaced, setting
 from garps_core.errors import ConfigError
+from garps_core.lifting import Lifting
 from garps_core.reconstruction_settings import DEPTH_NETWORKS, METHODS, SCENES, Reconstruction
+from garps_core.start_settings import STARTS, TWO_VIEW, Start
 
 __all__ = [
     "DEPTH_NETWORKS",
@@ -30,98 +32,6 @@ __all__ = [
     "Start",
     "preset_for",
 ]
-
-TWO_VIEW = ("mast3r", "dust3r", "adapter")
-"""Starts by a two-view network."""
-STARTS = ("auto", "features", "identity", *TWO_VIEW)
-
-
-@dataclass(frozen=True)
-class Lifting(Checked):
-    """How a pixel with depth becomes a Gaussian (`reconstruct`)."""
-
-    stride: int = setting(2, "use every n-th pixel in both image directions", unit="px", low=1, high=32)
-    noise_floor_m: float = setting(1.5e-3, "sigma of one depth reading at zero range", unit="m", low=0, high=1)
-    noise_linear: float = setting(3e-3, "sigma of one depth reading per metre of range", unit="m/m", low=0, high=1)
-    noise_quadratic_per_m: float = setting(
-        0.0,
-        "sigma of one depth reading per square metre of range (triangulation)",
-        unit="1/m",
-        low=0,
-        high=0.1,
-    )
-    scale_sigma: float = setting(5e-3, "relative scale error that a whole depth map may share", low=0, high=1)
-    warp_sigma: float = setting(2e-3, "relative smooth warp that a depth map may have", low=0, high=1)
-    patch_sigma: float = setting(
-        0.0, "relative error of depth that differs from place to place, too large for noise", low=0, high=1
-    )
-    common_scale_sigma: float = setting(
-        0.0, "relative scale error that both depth maps have in common, so that no picture shows it", low=0, high=1
-    )
-    pointing_sigma_rad: float = setting(
-        5e-4, "error of the direction a pixel looks in (0.25 px at a focal length of 500 px)", unit="rad", low=0, high=1
-    )
-    sigma_inflation: float = setting(
-        1.0, "sigmas of what this depth says, times this: for errors of another kind (calibrated)", low=1, high=100
-    )
-    edge_ratio: float = setting(
-        0.04, "drop pixels whose neighbours' depth differs by more than this share", unit="", low=1e-3, high=1
-    )
-    min_cosine: float = setting(
-        0.15, "surfaces seen flatter than this cosine are treated as seen at it", unit="", low=0.01, high=1
-    )
-    min_range_m: float = setting(0.1, "ignore depth below", unit="m", low=0, high=100)
-    max_range_m: float = setting(20.0, "ignore depth beyond", unit="m", low=0.1, high=1000)
-    smoothing_px: int = setting(5, "diameter of the edge-keeping depth filter, 0 = off", unit="px", low=0, high=15)
-    footprint: float = setting(0.5, "sigma of the footprint in pixel spacings", unit="px/px", low=0.05, high=5)
-    weighting: str = setting(
-        "area", "component weights: surface area seen, or one per pixel", choices=("area", "equal")
-    )
-
-
-@dataclass(frozen=True)
-class Start(Checked):
-    """Where the alignment starts (`initialise`)."""
-
-    method: str = setting(
-        "auto",
-        "auto = the given prior and features together, or the one there is, else identity when `identity_fallback`; "
-        "mast3r, dust3r, adapter = a two-view network, and the prior",
-        choices=STARTS,
-        live=False,
-    )
-    weights: str = setting(
-        "", "of mast3r, dust3r or the adapter: a name or a file; empty = the first installed", live=False
-    )
-    adapter: str = setting("", "name of an installed two-view adapter (docs/two_view_models.md)", live=False)
-    pose_from: str = setting(
-        "maps", "a two-view network's point maps, or matches of its descriptors", choices=("maps", "matches")
-    )
-    scale: str = setting(
-        "auto",
-        "whose metres a two-view network's pose gets: its own, or the depth's; auto = its own if it has any",
-        choices=("auto", "network", "depth"),
-    )
-    min_confidence: float = setting(
-        3.0, "points of which a two-view network is less sure are not used", unit="", low=0, high=1e6
-    )
-    network_scale_sigma: float = setting(0.1, "relative error of a two-view network's metre", low=0, high=1)
-    network_warp_sigma: float = setting(0.02, "relative smooth warp of a two-view network's points", low=0, high=1)
-    focal_sigma: float = setting(0.05, "relative error of a focal length that a network has estimated", low=0, high=1)
-    features: bool = setting(True, "match features also where a prior is given: they check and sharpen it")
-    max_contradiction: float = setting(
-        5.0, "given prior and features further apart than this are two rivals", unit="sigma", low=1, high=1e6
-    )
-    max_features: int = setting(2000, "SIFT features per image", low=50, high=20000)
-    match_ratio: float = setting(0.8, "ratio test of the feature matches", unit="", low=0.1, high=1)
-    ransac_px: float = setting(3.0, "inlier threshold of the pose estimate", unit="px", low=0.1, high=50)
-    min_inliers: int = setting(8, "fewer inliers than this is no pose", low=4, high=10000)
-    covariance_inflation: float = setting(
-        2.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
-    )
-    identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
-    identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
-    identity_sigma_rad: float = setting(0.2, "sigma of the identity start, rotation", unit="rad", low=1e-4, high=3)
 
 
 @dataclass(frozen=True)

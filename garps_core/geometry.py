@@ -98,3 +98,34 @@ def project(K: Array, points: Array) -> Array:
 def transform(T: Array, points: Array) -> Array:
     """Apply a 4x4 rigid motion to points (..., 3)."""
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _position_from_twist(t: Array) -> Array:
+    J = np.eye(6)
+    J[:3, 3:] = -skew(t)
+    return J
+
+
+def ros_from_twist(covariance: Array, T: Array) -> Array:
+    """6x6 covariance of a left twist at T -> (position, fixed-axis rotation), the ROS meaning."""
+    J = _position_from_twist(T[:3, 3])
+    return np.asarray(J @ covariance @ J.T)
+
+
+def twist_from_ros(covariance: Array, T: Array) -> Array:
+    """6x6 covariance in the ROS meaning -> of the left twist at T."""
+    J = np.linalg.inv(_position_from_twist(T[:3, 3]))
+    return np.asarray(J @ covariance @ J.T)
+
+
+def inverted(covariance: Array, T: Array) -> Array:
+    """Covariance (ROS meaning) of T^-1, given that of T: what swapping source and target does."""
+    inverse = se3_inverse(T)
+    A = adjoint(inverse)
+    return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)
+
+
+def displacement(points: Array, covariance: Array) -> Array:
+    """(n, 3, 3) covariance of points (n, 3) m moved by a pose with the given 6x6 covariance (left twist)."""
+    J = point_jacobian(points)
+    return np.asarray(J @ covariance @ J.transpose(0, 2, 1))

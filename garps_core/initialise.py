@@ -6,15 +6,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from garps_core.config import TWO_VIEW, Config, Start
+from garps_core.combinations import check_start
+from garps_core.config import Config
 from garps_core.descriptors import match_descriptors
-from garps_core.errors import ConfigError, InitialisationError, ModelError, WeightsError
+from garps_core.errors import InitialisationError, ModelError, WeightsError
 from garps_core.features import match_features
-from garps_core.geometry import se3_exp, se3_inverse, se3_log
+from garps_core.geometry import ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
 from garps_core.map_pose import pose_from_maps
 from garps_core.pnp import pose_from_matches
+from garps_core.start_settings import TWO_VIEW
 from garps_core.types import Prior, View
-from garps_core.uncertainty import ros_from_twist, twist_from_ros
 
 
 def initialise(
@@ -52,18 +53,6 @@ def initialise(
             raise
         return (identity(config, f"features failed: {failure}"),)
     return (found,) if prior is None or method == "features" else combined(prior, found, config.start.max_contradiction)
-
-
-def check_start(start: Start) -> None:
-    """Raises ConfigError for a two-view network that cannot do what the other settings of the start ask for."""
-    if start.method == "dust3r" and start.scale == "network":
-        raise ConfigError("start.scale is network, and dust3r has no metres: expected auto or depth")
-    if start.method == "dust3r" and start.pose_from == "matches":
-        raise ConfigError("start.pose_from is matches, and dust3r has no descriptors: expected maps")
-    if start.method == "adapter" and not start.adapter:
-        raise ConfigError(
-            "start.method is adapter and start.adapter is empty: expected the name of an installed adapter"
-        )
 
 
 def _by_network(source: View, target: View, config: Config) -> Prior:

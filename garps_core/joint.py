@@ -3,7 +3,7 @@
 
 Two maps that differ by a few per cent in scale and shape cannot be superposed rigidly; a rigid fit turns the
 difference into motion. So each map may have a smooth relative error, six polynomials of the ray's slopes
-(`systematic.py`), with a prior. Unknowns are the left twist of the pose and, where wanted, the errors of the source's
+(`depth_errors.py`), with a prior. Unknowns are the left twist of the pose and, where wanted, the errors of the source's
 and of the target's map: 6 or 18 numbers.
 
     d = R p (1 + phi(p) a_s) + t - y (1 + psi(y) a_t)
@@ -14,30 +14,19 @@ row is simply somewhere else, the pair loop is that of the pose alone, and J gai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse
+from garps_core.depth_errors import DEPTH_MODES, depth_modes
+from garps_core.geometry import Array, adjoint, se3_inverse
 from garps_core.objective import Evaluation, Pairs, combine, evaluate, moved_rows, row_sums, unpack
 from garps_core.pairing import Cloud
-from garps_core.systematic import DEPTH_MODES, depth_modes
+from garps_core.state import State
 
 MODES = DEPTH_MODES
-
-
-@dataclass(frozen=True)
-class State:
-    """Where the solver stands: pose T (4x4), errors (12,) of the source's, then the target's depth map, or (0,)."""
-
-    T: Array
-    errors: Array = field(default_factory=lambda: np.zeros(0))
-
-    def moved(self, step: Array) -> State:
-        """After a step (6 + errors,): a left twist, and what is added to the errors."""
-        return State(se3_exp(np.asarray(step[:6], np.float64)) @ self.T, self.errors + step[6:])
 
 
 def corrected(cloud: Cloud, errors: Array) -> Cloud:

@@ -6,26 +6,21 @@
     weight      = surface area the pixel stands for, so that near and flat-on surfaces are not counted more often
 
 The same code serves a depth sensor and a depth network: only the noise model in `Lifting` differs. What a whole depth
-map gets wrong is not in the components; the alignment knows of it (`systematic.py`, `joint.py`).
+map gets wrong is not in the components; the alignment knows of it (`depth_errors.py`, `joint.py`).
 """
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array, Float64Array
-from garps_core.config import Lifting
+from garps_core.depth_errors import depth_sigma
 from garps_core.errors import ReconstructionError
-from garps_core.photometric import brightness_of
-from garps_core.types import Frustum, Mixture, View
-
-MIN_COMPONENTS = 50
-FRUSTUM_STEP_PX = 4
-"""Spacing of the coarse depth map that answers "could that camera see this point"."""
+from garps_core.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
+from garps_core.lifting import Lifting
+from garps_core.types import Mixture, View
 
 Bool = npt.NDArray[np.bool_]
 
@@ -54,13 +49,6 @@ def lift(view: View, lifting: Lifting) -> Mixture:
             "check range limits, units and that the scene is not one edge"
         )
     return _lift(view, depth, rows, columns, lifting)
-
-
-def in_range(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """HxW m with NaN where a reading is outside the range that `lifting` allows."""
-    with np.errstate(invalid="ignore"):
-        usable = (depth >= lifting.min_range_m) & (depth <= lifting.max_range_m)
-    return np.where(usable, depth, np.float32(np.nan))
 
 
 def _smoothed(depth: Float32Array, lifting: Lifting) -> Float32Array:
@@ -94,12 +82,6 @@ def averaged_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
     return depth_sigma(depth, lifting) / np.float32(3 if lifting.smoothing_px > 1 else 1)
 
 
-def depth_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
-    """Standard deviation of one depth reading, m, same shape (`Lifting.noise_*`)."""
-    noise = lifting.noise_floor_m + depth * (lifting.noise_linear + depth * lifting.noise_quadratic_per_m)
-    return np.asarray(noise, np.float32)
-
-
 def _sampled(depth: Float32Array, lifting: Lifting) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Rows and columns, on the sampling grid, of usable pixels in Z-order."""
     s = lifting.stride
@@ -115,17 +97,6 @@ def _smooth_surface(depth: Float32Array, lifting: Lifting) -> Bool:
     far = cv2.dilate(filled, kernel)
     near = cv2.erode(np.where(filled > 0, filled, np.float32(1e6)), kernel)
     return np.asarray(far - near < lifting.edge_ratio * 2 * near, bool)
-
-
-@lru_cache(maxsize=8)
-def z_order(height: int, width: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Rows and columns of a grid\'s cells along a Z-order curve: every n-th cell is an even subsample."""
-    y, x = np.mgrid[0:height, 0:width]
-    key = np.zeros(y.shape, np.int64)
-    for bit in range(14):
-        key |= ((x >> bit) & 1) << (2 * bit) | ((y >> bit) & 1) << (2 * bit + 1)
-    order = np.argsort(key, axis=None)
-    return y.ravel()[order], x.ravel()[order]
 
 
 def _lift(
@@ -214,13 +185,3 @@ def _covariances(
             element = sum((span[i] * span[j] for span in spans), start=floor if i == j else np.float32(0))
             covariances[:, i, j] = covariances[:, j, i] = element
     return covariances
-
-
-def frustum_of(view: View, depth: Float32Array, lifting: Lifting) -> Frustum:
-    """What the camera of the view could see, on a coarse grid; depth is HxW m, NaN where unknown."""
-    step = FRUSTUM_STEP_PX
-    K = view.K.copy()
-    K[:2] /= step
-    K[:2, 2] -= (step // 2) / step  # grid cell i holds pixel i * step + step // 2
-    seen = np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step])
-    return Frustum(K, seen, brightness_of(view.rgb, step), lifting.patch_sigma)

@@ -4,27 +4,25 @@
 Each order of the pair gives a pose; the one whose maps are surer of themselves is kept (as the authors of DUSt3R do),
 refined on its inliers. Neighbouring pixels err alike: how much less they are worth than so many independent ones, is
 measured by adding up their residuals in blocks of the picture. The covariance also grows where the two orders
-contradict each other, and gets what all points share: an error of scale and a smooth warp (`systematic.py`).
+contradict each other, and gets what all points share: an error of scale and a smooth warp (`depth_errors.py`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.checks import Float32Array
+from garps_core.bearings import ransac
 from garps_core.config import Config
+from garps_core.depth_errors import shared_sigmas
 from garps_core.errors import InitialisationError, InputError
-from garps_core.geometry import Array, adjoint, se3_exp, se3_inverse, se3_log, transform
-from garps_core.match_depth import OneWay
-from garps_core.pnp import MIN_PIXEL_SIGMA, REFINEMENT_STEPS, Normal, inliers_of, keep, normal_equations, ransac
+from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse, se3_log, transform
+from garps_core.match_depth import MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
+from garps_core.pnp import REFINEMENT_STEPS
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
-from garps_core.systematic import shared_sigmas
 from garps_core.types import Prior, View
-from garps_core.uncertainty import ros_from_twist
 
 STEP_PX = 4
 """Every so many pixels of a map, both ways, are used: its neighbours say the same."""
@@ -240,24 +238,3 @@ def _contradiction(one: _Pose, other: _Pose) -> float:
     difference = se3_log(one.T @ se3_inverse(other.T))
     apart = float(difference @ np.linalg.solve(one.noise + other.noise, difference))
     return max(1.0, apart / len(difference))
-
-
-def own_depth(maps: PairMaps, source: View, target: View, min_confidence: float) -> tuple[Float32Array, Float32Array]:
-    """Depth of both views by the maps in their own frames, HxW float32, NaN outside what the network saw and trusted.
-
-    Metres only where `maps.metric`.
-    """
-    orders = _orders(maps, source, target, min_confidence)
-    of_source, of_target = (_depth_of_first(order) for order in orders.values())
-    return of_source, of_target
-
-
-def _depth_of_first(order: _Order) -> Float32Array:
-    framing, z = order.framings[0], order.maps[0].points[..., 2]
-    z = np.where(order.trusted[0] & (z > 0), z, np.float32(np.nan))
-    height, width = order.views[0].rgb.shape[:2]
-    u = (np.arange(width, dtype=np.float32) + 0.5) * framing.scale[0] - framing.offset[0] - 0.5
-    v = (np.arange(height, dtype=np.float32) + 0.5) * framing.scale[1] - framing.offset[1] - 0.5
-    columns, rows = np.meshgrid(u, v)
-    moved = cv2.remap(z, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
-    return np.asarray(moved, np.float32)

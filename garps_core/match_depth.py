@@ -16,8 +16,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from garps_core.geometry import Array, project, transform
+from garps_core.depth_errors import depth_sigma, shared_errors
+from garps_core.geometry import Array, point_jacobian, project, transform
+from garps_core.lifting import Lifting
+
+MIN_PIXEL_SIGMA = 0.3
+"""px; no residuals, however small, make a match more precise than features are."""
+HUBER = 2.0
+"""Residuals beyond this many sigmas count with their length, not its square."""
+READINGS_AVERAGE = 3.0
+"""The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
+Bool = npt.NDArray[np.bool_]
 
 STEPS = 3
 """Of each match's depth under one pose."""
@@ -102,3 +113,66 @@ def _directions(along: Array) -> tuple[Array, Array]:
     """Unit vectors (n, 2), any where there is no parallax, and lengths (n, 1) px."""
     length = np.linalg.norm(along, axis=1, keepdims=True)
     return np.where(length > NO_PARALLAX, along / np.maximum(length, NO_PARALLAX), [1.0, 0.0]), length
+
+
+def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 0.0) -> Bool:
+    """Which of the way's points T brings in front of the camera and within so many pixels of where it saw them.
+
+    Where depth is off by `patch_sigma` from place to place, so many sigmas of that and of one pixel are allowed.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = seen_at_likely_depths(way, T, 1.0, np.full(len(way.points), patch_sigma))
+        sigmas = whitened(seen, 1.0, patch_sigma)
+    return np.asarray((seen.moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
+
+
+def keep(way: OneWay, mask: Bool) -> OneWay:
+    """The matches where mask is true."""
+    return OneWay(way.points[mask], way.px[mask], way.K)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of one direction over the left twist of the pose that moves its points."""
+
+    informations: Array
+    """(n, 6, 6) what each match adds to the Hessian `H`."""
+    scores: Array
+    """(n, 6) what each match adds to the gradient `b`."""
+    from_points: Array
+    """(6, 8) d b per unit of each error that the view which measured the points may share (`depth_errors.py`)."""
+    from_pixels: Array
+    """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
+    residual_px: Array
+    """What tells the noise of pixels: (n, 2), or (n,) across epipolar lines where depth is off by more than noise."""
+
+    @property
+    def H(self) -> Array:
+        """(6, 6) Gauss-Newton Hessian of half the sum of squares."""
+        return np.asarray(self.informations.sum(0))
+
+    @property
+    def b(self) -> Array:
+        """(6,) gradient of half the sum of squares."""
+        return np.asarray(self.scores.sum(0))
+
+
+def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
+    """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
+    sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / READINGS_AVERAGE
+    relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
+    seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
+    residual, along = seen.residual, seen.along
+    D = seen.by_point
+    J = D @ point_jacobian(seen.moved)
+    C = pixel_sigma**2 * np.eye(2) + along[:, :, None] * along[:, None, :] * relative[:, None, None] ** 2
+    W = np.linalg.inv(C)
+    size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
+    W = W * np.minimum(1.0, HUBER / size)[:, None, None]
+    JW = J.transpose(0, 2, 1) @ W
+    fields = D @ (T[:3, :3] @ shared_errors(seen.points))
+    pointing = np.zeros((2, 8))
+    pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
+    scores = (JW @ residual[..., None])[..., 0]
+    of_pixels = across(seen) if lifting.patch_sigma > 0 else residual
+    return Normal(JW @ J, scores, (JW @ fields).sum(0), JW.sum(0) @ pointing, of_pixels)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from garps_core import neighbours
 from garps_core.config import Alignment, Config, Rung
-from garps_core.errors import ConfigError
+from garps_core.devices import checked_device
 from garps_core.geometry import Array, se3_inverse
 from garps_core.objective import Pairs, on_compiled_path, pack
 from garps_core.types import Frustum, Mixture
@@ -44,21 +44,6 @@ class Cloud:
             part.index_select(0, index) for part in (self.means, self.covariances, self.weights, self.colours)
         )
         return Cloud(means, covariances, weights, colours, labels, self.frustum)
-
-
-def checked_device(name: str) -> torch.device:
-    """The device `name`. Raises ConfigError when it is none, or not there."""
-    try:
-        device = torch.device(name)
-        if device.type in ("cpu", "cuda"):
-            torch.empty(1, device=device)
-            return device
-    except (RuntimeError, AssertionError):  # an unknown name; torch without CUDA asserts
-        pass
-    there = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
-    raise ConfigError(
-        f"device is {name!r}, which is not there: expected one of {', '.join(there)}; set device to 'cpu'"
-    )
 
 
 def to_cloud(mixture: Mixture, config: Config) -> Cloud:

@@ -23,9 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array
+from garps_core.depth_errors import shared_errors
 from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
-from garps_core.systematic import shared_errors
 
 GRIDS = (8, 4, 2, 1)
 """Every n-th cell of the frustum's grid, coarse to fine: a basin of some pixels of the first."""
@@ -93,7 +93,7 @@ class Comparison:
     information: Array
     gradient: Array
     of_depth: Array
-    """(6, 8) gradient per unit of each error that the points may share (`systematic.py`)."""
+    """(6, 8) gradient per unit of each error that the points may share (`depth_errors.py`)."""
     correlation: float
     share: float
 
@@ -149,13 +149,6 @@ def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array
     if f is None or b is None:
         return None
     return Sharpened(T, covariance, min(f.correlation, b.correlation), min(f.share, b.share))
-
-
-def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:
-    """HxWx3 uint8 -> grey 0..1 at every step-th pixel, low-passed to that spacing."""
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    smooth = cv2.GaussianBlur(grey, (0, 0), 0.5 * step)
-    return np.ascontiguousarray(smooth[step // 2 :: step, step // 2 :: step]).astype(np.float32) / np.float32(255)
 
 
 @lru_cache(maxsize=16)

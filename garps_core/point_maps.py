@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.errors import ConfigError, ModelError
 from garps_core.geometry import Array
+from garps_core.types import View
 
 Picture = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
@@ -129,3 +131,25 @@ class TwoViewModel(Protocol):
         Raises:
             ModelError: too little memory, or values that are not finite. InputError: a picture it cannot take.
         """
+
+
+def own_depth(maps: PairMaps, source: View, target: View, min_confidence: float) -> tuple[Float32Array, Float32Array]:
+    """Depth of both views by the maps in their own frames, HxW float32, NaN outside what the network saw and trusted.
+
+    Metres only where `maps.metric`.
+    """
+    first = (maps.source_first[0], maps.target_first[0])
+    of_source, of_target = map(_own_depth, (source, target), first, maps.trusted(min_confidence), maps.framings)
+    return of_source, of_target
+
+
+def _own_depth(view: View, one: PointMap, trusted: Bool, framing: Framing) -> Float32Array:
+    z = one.points[..., 2]
+    known = trusted & np.isfinite(one.points).all(-1) & (z > 0)
+    height, width = view.rgb.shape[:2]
+    u = (np.arange(width, dtype=np.float32) + 0.5) * framing.scale[0] - framing.offset[0] - 0.5
+    v = (np.arange(height, dtype=np.float32) + 0.5) * framing.scale[1] - framing.offset[1] - 0.5
+    columns, rows = np.meshgrid(u, v)
+    z = np.where(known, z, np.float32(np.nan))
+    moved = cv2.remap(z, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    return np.asarray(moved, np.float32)

@@ -17,11 +17,12 @@ from dataclasses import replace
 import numpy as np
 
 from garps_core.checks import Float32Array
-from garps_core.config import DEPTH_NETWORKS, TWO_VIEW, Config
+from garps_core.combinations import check_settings
+from garps_core.config import DEPTH_NETWORKS, Config
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
-from garps_core.initialise import check_start
-from garps_core.lift import MIN_COMPONENTS, lift
-from garps_core.map_pose import own_depth
+from garps_core.frustum import MIN_COMPONENTS
+from garps_core.lift import lift
+from garps_core.point_maps import own_depth
 from garps_core.types import Mixture, View
 
 
@@ -142,27 +143,3 @@ def mixtures_of(views: Sequence[View], config: Config) -> list[Mixture]:
         return [mixture_of(view, config) for view in views]
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(mixture_of, views, [config] * len(views)))
-
-
-def check_settings(config: Config) -> None:
-    """Raises ConfigError where depth from a network meets settings for a sensor's; for auto it is a view's fault."""
-    check_start(config.start)
-    if config.reconstruction.method == "two_view" and config.start.method not in TWO_VIEW:
-        raise ConfigError(
-            f"reconstruction.method is two_view and start.method is {config.start.method}: expected a two-view network "
-            f"to start with, one of {', '.join(TWO_VIEW)}"
-        )
-    if config.reconstruction.method == "two_view" and config.start.method == "dust3r":
-        raise ConfigError("reconstruction.method is two_view and the points of dust3r have no metres: expected mast3r")
-    if config.alignment.depth_errors or config.alignment.solver == "adam":
-        return
-    if config.reconstruction.method == "auto":
-        raise ReconstructionError(
-            "the view has no depth: expected HxW float32 metres; give View(..., depth=...), or take the preset "
-            "monocular, which asks a network"
-        )
-    raise ConfigError(
-        f"reconstruction.method is {config.reconstruction.method}, whose depth is off by per cents as a whole, and "
-        "alignment.depth_errors is false, as for a sensor, so the covariance would promise too much: expected the "
-        "preset monocular"
-    )

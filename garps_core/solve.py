@@ -11,15 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from garps_core.config import Alignment, Rung
-from garps_core.geometry import Array, point_jacobian, se3_inverse, se3_log, skew
-from garps_core.joint import State, corrected, evaluate_at, two_sided
+from garps_core.geometry import Array, displacement, se3_inverse, se3_log, skew
+from garps_core.joint import corrected, evaluate_at, two_sided
 from garps_core.objective import Evaluation, Pairs, unpack
 from garps_core.pairing import Cloud, pair_up, thin, visible
+from garps_core.state import Belief, State
 
 _SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
 """Compiled loops release the interpreter: target to source is computed beside source to target."""
@@ -110,21 +111,6 @@ def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
     return values, L @ vectors, scale
 
 
-@dataclass(frozen=True)
-class Belief:
-    """What is known beforehand: the pose T, its precision (6, 6) over the left twist, and that of the errors (e,)."""
-
-    T: Array
-    precision: Array
-    error_precision: Array = field(default_factory=lambda: np.zeros(0))
-
-    def joint(self) -> Array:
-        """Precision over all unknowns, (6 + e, 6 + e)."""
-        joint = np.diag(np.concatenate([np.zeros(6), self.error_precision]))
-        joint[:6, :6] = self.precision
-        return joint
-
-
 def posterior(data: Evaluation, at: State, known: Belief, weight: float) -> Posterior:
     """Add the prior to `weight` times the data term."""
     r = np.concatenate([se3_log(at.T @ se3_inverse(known.T)), at.errors])
@@ -195,12 +181,6 @@ def rung_pairs(
 
 def _at_resolution(cloud: Cloud, rung: Rung, density: float) -> Cloud:
     return thin(cloud, max(rung.components, int(density * len(cloud) / max(rung.covariance_scale, 1.0))))
-
-
-def displacement(points: Array, covariance: Array) -> Array:
-    """(n, 3, 3) covariance of points (n, 3) m moved by a pose with the given 6x6 covariance (left twist)."""
-    J = point_jacobian(points)
-    return np.asarray(J @ covariance @ J.transpose(0, 2, 1))
 
 
 def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:

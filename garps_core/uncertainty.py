@@ -9,42 +9,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from garps_core.config import Lifting
-from garps_core.geometry import Array, adjoint, point_jacobian, se3_inverse, skew
-from garps_core.joint import State, backward_jacobian
+from garps_core.depth_errors import DEPTH_MODES, shared_errors, shared_sigmas
+from garps_core.geometry import Array, point_jacobian, ros_from_twist, se3_inverse
+from garps_core.joint import backward_jacobian
+from garps_core.lifting import Lifting
 from garps_core.objective import Pairs, row_information
-from garps_core.solve import Belief, Solution, curvature
-from garps_core.systematic import DEPTH_MODES, shared_errors, shared_sigmas
+from garps_core.solve import Solution, curvature
+from garps_core.state import Belief, State
 
 OPEN_BELOW = 0.02
 """A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""
 OPEN_DIRECTION = 1e-5
 """Share of the curvature that open directions are given: a very large variance."""
-
-
-def _position_from_twist(t: Array) -> Array:
-    J = np.eye(6)
-    J[:3, 3:] = -skew(t)
-    return J
-
-
-def ros_from_twist(covariance: Array, T: Array) -> Array:
-    """6x6 covariance of a left twist at T -> (position, fixed-axis rotation), the ROS meaning."""
-    J = _position_from_twist(T[:3, 3])
-    return np.asarray(J @ covariance @ J.T)
-
-
-def twist_from_ros(covariance: Array, T: Array) -> Array:
-    """6x6 covariance in the ROS meaning -> of the left twist at T."""
-    J = np.linalg.inv(_position_from_twist(T[:3, 3]))
-    return np.asarray(J @ covariance @ J.T)
-
-
-def inverted(covariance: Array, T: Array) -> Array:
-    """Covariance (ROS meaning) of T^-1, given that of T: what swapping source and target does."""
-    inverse = se3_inverse(T)
-    A = adjoint(inverse)
-    return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)
 
 
 def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Array:

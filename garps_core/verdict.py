@@ -9,11 +9,10 @@ import numpy as np
 
 from garps_core.checks import Float64Array
 from garps_core.config import Alignment
-from garps_core.geometry import se3_inverse, se3_log
+from garps_core.geometry import displacement, se3_inverse, se3_log, twist_from_ros
 from garps_core.photometric import Sharpened
-from garps_core.solve import Solution, displacement
+from garps_core.solve import Solution
 from garps_core.types import Mixture, Prior, Status
-from garps_core.uncertainty import twist_from_ros
 
 RIGHT_M, RIGHT_RAD = 0.05, float(np.radians(2.0))
 """What `quality` means by right."""

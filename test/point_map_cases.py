@@ -10,9 +10,9 @@ import torch
 
 from bench.rooms import RoomPair
 from garps_core import View
+from garps_core.depth_errors import depth_modes
 from garps_core.geometry import pixel_rays, se3_inverse, transform
 from garps_core.point_maps import Framing, PairMaps, PointMap
-from garps_core.systematic import depth_modes
 
 LONG_SIDE = 256
 PATCH = 16

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from garps_core import Config, Mixture, Prior, View, reconstruct
-from garps_core.geometry import pixel_rays, se3_exp, se3_inverse, transform
-from garps_core.uncertainty import ros_from_twist
+from garps_core.geometry import pixel_rays, ros_from_twist, se3_exp, se3_inverse, transform
 
 torch.set_num_threads(1)  # threads that wait for each other on a shared machine cost more than they bring
 

@@ -12,9 +12,9 @@ from garps_core import Config, pnp
 from garps_core.bearings import MIN_LENGTHS, pose_from_bearings, triangulated
 from garps_core.errors import InitialisationError
 from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
-from garps_core.match_depth import OneWay, Seen, across, seen_at_likely_depths, whitened
+from garps_core.match_depth import READINGS_AVERAGE, OneWay, Seen, across, inliers_of, seen_at_likely_depths, whitened
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import READINGS_AVERAGE, inliers_of, pose_from_matches
+from garps_core.pnp import pose_from_matches
 
 ASIDE = se3_exp(np.array([0.5, -0.1, 0.1, 0.03, 0.2, -0.02]))
 """Half a metre apart: 20 % of the depth is 10 px and more."""

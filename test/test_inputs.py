@@ -21,7 +21,8 @@ from garps_core import (
     estimate_relative_pose,
     reconstruct,
 )
-from garps_core.config import Alignment, Lifting, Rung
+from garps_core.config import Alignment, Rung
+from garps_core.lifting import Lifting
 
 RGB = np.zeros((48, 64, 3), np.uint8)
 K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])

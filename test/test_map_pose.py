@@ -10,10 +10,9 @@ from point_map_cases import Errors, exact_points, framing_of, point_maps, true_v
 from bench.rooms import make_pair
 from garps_core import Config, ConfigError, View
 from garps_core.errors import InitialisationError
-from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
-from garps_core.map_pose import own_depth, pose_from_maps
-from garps_core.point_maps import Framing
-from garps_core.uncertainty import twist_from_ros
+from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform, twist_from_ros
+from garps_core.map_pose import pose_from_maps
+from garps_core.point_maps import Framing, own_depth
 
 CONFIG = Config.preset("monocular")
 LANDSCAPE, PORTRAIT = (320, 240), (240, 320)

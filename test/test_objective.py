@@ -16,10 +16,10 @@ from surfaces import moved, permuted, random_mixture, random_pose
 from garps_core import Config, objective
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import adjoint, se3_exp, se3_inverse
-from garps_core.joint import State
 from garps_core.objective import evaluate
 from garps_core.pairing import pair_up, to_cloud, without_floor
 from garps_core.solve import two_way
+from garps_core.state import State
 
 DOUBLE = Config(dtype="float64")
 SETTINGS = Alignment(colour_variance=0.3, semantic_discount=0.7, outlier_floor=0.05, max_distance_m=2.0)

@@ -9,10 +9,11 @@ import pytest
 from surfaces import TRUTH, K, flat, grey_at, look, off, room
 
 from garps_core import Config, photometric, reconstruct
+from garps_core.depth_errors import shared_sigmas
+from garps_core.frustum import brightness_of
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
-from garps_core.photometric import brightness_of, sharpen
-from garps_core.systematic import shared_sigmas
+from garps_core.photometric import sharpen
 
 SCENE = {"camera": np.diag([2, 2, 1]) @ K, "size": (240, 320)}
 NEAR = np.diag([0.03**2] * 3 + [np.radians(0.6) ** 2] * 3)

@@ -12,7 +12,7 @@ from garps_core import Config, Status, align, align_mixtures, estimate_relative_
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import identity
 from garps_core.pairing import to_cloud
-from garps_core.solve import Belief
+from garps_core.state import Belief
 
 FROM_IDENTITY = Config().replace({"start.method": "identity"})
 LADDER_ONLY = FROM_IDENTITY.replace({"alignment.guess_uncertainty": 1e6})

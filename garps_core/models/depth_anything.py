@@ -19,13 +19,13 @@ import torch
 from torch import Tensor, nn
 
 from garps_core.checks import Float32Array
+from garps_core.devices import checked_device
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import vit
 from garps_core.models.dpt import DptHead, Grid, enlarged
 from garps_core.models.loading import load_strictly
 from garps_core.models.manifest import MAX_DEPTH_M
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
-from garps_core.pairing import checked_device
 
 RGBImage = npt.NDArray[np.uint8]
 

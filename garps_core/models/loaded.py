@@ -16,6 +16,7 @@ from torch import nn
 
 from garps_core.checks import Float32Array, IntArray
 from garps_core.config import Config, Reconstruction
+from garps_core.devices import checked_device
 from garps_core.errors import ModelError, ReconstructionError, WeightsError
 from garps_core.models import demo_net, mask2former, semantics
 from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
@@ -23,7 +24,6 @@ from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
 from garps_core.models.manifest import BY_NAME, PERMISSIVE, licence_of, named, of_file, range_of
 from garps_core.models.store import default, installed, weights_folder
-from garps_core.pairing import checked_device
 from garps_core.types import View
 
 AT_THE_END = 0.98

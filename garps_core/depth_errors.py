@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from garps_core.config import Lifting
+from garps_core.checks import Float32Array
 from garps_core.geometry import Array
+from garps_core.lifting import Lifting
 
 FIELD_SLOPE = 0.6
 """Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""
@@ -46,3 +47,9 @@ def shared_errors(points: Array) -> Array:
 def shared_sigmas(lifting: Lifting) -> Array:
     """Sigmas (8,) of the modes."""
     return np.array([lifting.scale_sigma] + [lifting.warp_sigma] * 5 + [lifting.pointing_sigma_rad] * 2)
+
+
+def depth_sigma(depth: Float32Array, lifting: Lifting) -> Float32Array:
+    """Standard deviation of one depth reading, m, same shape (`Lifting.noise_*`)."""
+    noise = lifting.noise_floor_m + depth * (lifting.noise_linear + depth * lifting.noise_quadratic_per_m)
+    return np.asarray(noise, np.float32)
