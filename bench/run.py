@@ -51,7 +51,7 @@ from bench.sources import (
 from bench.tables import Row, machine_facts
 from bench.variants import GARPS, GARPS_NO_FEATURES, GARPS_PAPER, VARIANTS
 from garps_core import Config, GarpsError
-from garps_core.settings import changed_config, read_settings
+from garps_core.config.text import changed_config, read_settings
 
 GROUPS = {"ablations": list(VARIANTS), "peers": list(METHODS)}
 """Names that stand for several methods."""

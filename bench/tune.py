@@ -52,8 +52,8 @@ from bench.sources import (
 )
 from bench.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
 from garps_core import Config, GarpsError
+from garps_core.config.text import write_settings
 from garps_core.metrics import CHI2_6_95
-from garps_core.settings import write_settings
 
 SPACES: dict[str, dict[str, tuple[float, float]]] = {
     SENSOR: {

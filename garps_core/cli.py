@@ -16,17 +16,17 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
-from garps_core.combinations import check_settings
 from garps_core.config import METHODS, PRESETS, Config, Reconstruction, preset_for
+from garps_core.config.combinations import check_settings
+from garps_core.config.start import STARTS, TWO_VIEW
+from garps_core.config.text import changed_config, read_settings
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.files import read_image, read_view
 from garps_core.focal import estimate_intrinsics
 from garps_core.initialise import identity
 from garps_core.report import as_json, as_text
-from garps_core.settings import changed_config, read_settings
 from garps_core.splat_reader import read_splats
-from garps_core.start_settings import STARTS, TWO_VIEW
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.weights_cli import app as weights_app
 

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from garps_core.checks import Float32Array
+from garps_core.config.lifting import Lifting
 from garps_core.geometry import Array
-from garps_core.lifting import Lifting
 
 FIELD_SLOPE = 0.6
 """Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""

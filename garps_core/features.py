@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from garps_core.config.start import Start
 from garps_core.geometry import Array, pixel_rays
-from garps_core.start_settings import Start
 from garps_core.types import View
 
 RELIEF_RATIO = 0.03

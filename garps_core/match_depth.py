@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma, shared_errors
 from garps_core.geometry import Array, point_jacobian, project, transform
-from garps_core.lifting import Lifting
 
 MIN_PIXEL_SIGMA = 0.3
 """px; no residuals, however small, make a match more precise than features are."""

@@ -17,8 +17,8 @@ from dataclasses import replace
 import numpy as np
 
 from garps_core.checks import Float32Array
-from garps_core.combinations import check_settings
 from garps_core.config import DEPTH_NETWORKS, Config
+from garps_core.config.combinations import check_settings
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
 from garps_core.frustum import MIN_COMPONENTS
 from garps_core.lift import lift

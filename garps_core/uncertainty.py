@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import DEPTH_MODES, shared_errors, shared_sigmas
 from garps_core.geometry import Array, point_jacobian, ros_from_twist, se3_inverse
 from garps_core.joint import backward_jacobian
-from garps_core.lifting import Lifting
 from garps_core.objective import Pairs, row_information
 from garps_core.solve import Solution, curvature
 from garps_core.state import Belief, State

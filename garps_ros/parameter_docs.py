@@ -33,7 +33,7 @@ INDENT = " " * 4
 INTRODUCTION = """\
 # Parameters of the live node
 
-Generated from the settings in `garps_ros/settings.py` and `garps_core/config.py`; change those, then run
+Generated from the settings in `garps_ros/settings.py` and `garps_core/config/config.py`; change those, then run
 `python -m garps_ros.parameter_docs`.
 
 `pose_node` has two kinds of parameters: its own, and every setting of the estimator under the name it has everywhere

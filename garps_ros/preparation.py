@@ -12,12 +12,12 @@ import numpy as np
 
 from garps_core import compiled
 from garps_core.align import estimate_relative_pose
-from garps_core.combinations import check_settings, check_start
 from garps_core.config import DEPTH_NETWORKS, Config, Reconstruction
+from garps_core.config.combinations import check_settings, check_start
+from garps_core.config.lifting import Lifting
+from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
-from garps_core.lifting import Lifting
 from garps_core.reconstruct import with_depth
-from garps_core.start_settings import TWO_VIEW, Start
 from garps_core.types import Prior, View
 from garps_ros.tracking import MIN_DEPTH_SHARE
 

@@ -19,8 +19,8 @@ from rich.progress import Progress
 
 from garps_core.align import estimate_relative_pose
 from garps_core.config import METHODS, PRESETS, Config, preset_for
+from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
-from garps_core.settings import changed_config, read_settings
 from garps_core.types import PoseEstimate, View
 from garps_ros.bags import Bag, BagError
 from garps_ros.cameras import CameraTopics

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from garps_core.config import PRESETS
-from garps_core.described import Checked, setting
+from garps_core.config.field import Checked, setting
 from garps_core.errors import ConfigError
 
 

@@ -9,7 +9,7 @@ import pytest
 from graph import SECOND, Camera, NodeProcess, Peer, room_pair
 
 from garps_core import Config, Status, estimate_relative_pose
-from garps_core.settings import changed_config
+from garps_core.config.text import changed_config
 from garps_ros.views import view_from_messages
 from msg_adapters import header_stamp_ns, pose_from_message
 

@@ -8,7 +8,7 @@ import typer
 from typer.testing import CliRunner
 
 from garps_core import Config
-from garps_core.settings import read_settings
+from garps_core.config.text import read_settings
 
 pytest.importorskip("optuna")
 from bench import tune

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from garps_core import Mixture
+from garps_core.config.lifting import Lifting
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.lifting import Lifting
 from garps_core.models.flash3d import Flash3D, GaussianMaps, flash3d_network, flash3d_tensors
 from garps_core.models.flash3d_mixture import (
     Flash3DGaussians,

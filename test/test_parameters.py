@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from garps_core.config import PRESETS, Config
-from garps_core.described import Checked, setting
+from garps_core.config.field import Checked, setting
 from garps_core.errors import ConfigError
 from garps_ros import parameter_docs
 from garps_ros.parameters import parameters, settings_from

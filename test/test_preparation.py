@@ -10,9 +10,9 @@ from recordings import PERIOD, START, write
 from ros_messages import camera_info, image
 
 from garps_core import Config, estimate_relative_pose
+from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
 from garps_core.models import depth_anything, loaded
-from garps_core.settings import changed_config
 from garps_ros import preparation, replay
 from garps_ros.assembly import DEPTH, IMAGE, Assembly
 from garps_ros.cameras import CameraTopics, Frame

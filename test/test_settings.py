@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from garps_core import Config, ConfigError, cli
 from garps_core.config import PRESETS
-from garps_core.settings import MAX_BYTES, read_settings, write_settings
+from garps_core.config.text import MAX_BYTES, read_settings, write_settings
 
 
 def written(tmp_path: Path, text: str) -> Path:

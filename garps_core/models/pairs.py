@@ -8,13 +8,13 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from garps_core.config import Config
+from garps_core.config.start import TWO_VIEW
 from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, WeightsError
 from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
 from garps_core.models.manifest import of_file
 from garps_core.models.naver import NaverModel, digest
 from garps_core.models.two_view import TwoView, built_from
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
-from garps_core.start_settings import TWO_VIEW
 
 ADAPTERS = "garps_core.two_view"
 """Entry points of installed packages in this group are adapters: `NAME = "package.module:load"`."""

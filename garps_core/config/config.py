@@ -10,28 +10,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from garps_core.alignment_settings import Alignment, Rung
-from garps_core.described import Checked, flattened, replaced, setting
+from garps_core.config.alignment import Alignment, Rung
+from garps_core.config.field import Checked, flattened, replaced, setting
+from garps_core.config.lifting import Lifting
+from garps_core.config.reconstruction import Reconstruction
+from garps_core.config.start import Start
 from garps_core.errors import ConfigError
-from garps_core.lifting import Lifting
-from garps_core.reconstruction_settings import DEPTH_NETWORKS, METHODS, SCENES, Reconstruction
-from garps_core.start_settings import STARTS, TWO_VIEW, Start
-
-__all__ = [
-    "DEPTH_NETWORKS",
-    "METHODS",
-    "PRESETS",
-    "SCENES",
-    "STARTS",
-    "TWO_VIEW",
-    "Alignment",
-    "Config",
-    "Lifting",
-    "Reconstruction",
-    "Rung",
-    "Start",
-    "preset_for",
-]
 
 
 @dataclass(frozen=True)

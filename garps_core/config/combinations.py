@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from garps_core.config import TWO_VIEW, Config, Start
+from garps_core.config.config import Config
+from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import (
     ConfigError,
     ReconstructionError,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from garps_core.described import Checked, setting
+from garps_core.config.field import Checked, setting
 
 METHODS = ("auto", "rgbd", "depth_anything_v2", "demo_net", "flash3d", "two_view", "ply")
 DEPTH_NETWORKS = ("depth_anything_v2", "demo_net")

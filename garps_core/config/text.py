@@ -10,7 +10,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from garps_core.config import Config
+from garps_core.config.config import Config
 from garps_core.errors import ConfigError
 
 MAX_BYTES = 2**20
