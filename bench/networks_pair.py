@@ -28,7 +28,7 @@ from garps_core import Config, PoseEstimate, View, estimate_relative_pose
 from garps_core.models import loaded
 from garps_core.models.depth_anything import DepthAnythingV2
 from garps_core.models.flash3d import Flash3D
-from garps_core.models.manifest import BY_NAME
+from garps_core.weights.manifest import BY_NAME
 
 METHODS = ("depth_anything_v2", "flash3d")
 STAGES = ("depth", "reconstruct", "initialise", "align")

@@ -33,7 +33,7 @@ from bench.depth_errors import DepthErrors, depth_errors
 from bench.depth_pictures import BATCH, Pictures, batches
 from bench.tables import machine_facts
 from garps_core.models.demo_net import FILE, WHAT_IT_IS, DemoNet, Unit
-from garps_core.models.files import write_tensors
+from garps_core.weights.reader import write_tensors
 
 HELD_OUT_SEED = 90_000
 """First seed of the rooms that only measure."""

@@ -16,9 +16,9 @@ from garps_core.align import align_mixtures
 from garps_core.checks import Float64Array
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
 from garps_core.models.demo_net import WHAT_IT_IS
-from garps_core.models.manifest import ALL
-from garps_core.models.store import installed, weights_folder
 from garps_core.types import Mixture, Prior
+from garps_core.weights.manifest import ALL
+from garps_core.weights.store import installed, weights_folder
 
 REQUIRED = ("numpy", "scipy", "torch", "cv2", "poselib", "typer", "safetensors")
 OPTIONAL = {

@@ -60,7 +60,7 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     if not needing or method == "rgbd":
         return list(views)
     check_settings(config)
-    from garps_core.models import loaded  # networks cost nothing where none is used
+    from garps_core.models import loaded
 
     try:
         depths = loaded.depths([views[i] for i in needing], config)

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from garps_core.errors import WeightsError
-from garps_core.models.manifest import ALL
-from garps_core.models.store import installed, weights_folder
+from garps_core.weights.manifest import ALL
+from garps_core.weights.store import installed, weights_folder
 
 app = typer.Typer(help="Weights of the networks: list, fetch, verify, convert, check.", rich_markup_mode=None)
 
@@ -63,7 +63,7 @@ def fetch(
     HF_ENDPOINT names another hub, GARPS_WEIGHTS another folder. Prints the licence first. Nothing else in GARPS uses
     the network, and nothing is ever fetched by itself.
     """
-    from garps_core.models.fetch import fetch as fetched
+    from garps_core.weights.fetch import fetch as fetched
 
     fetched(name, accept_licence)
     return 0
@@ -80,7 +80,7 @@ def verify(
     \b
     Exit code: 0 = all as they should be, 1 = at least one is not, or none is installed.
     """
-    from garps_core.models.verify import verify as verified
+    from garps_core.weights.verify import verify as verified
 
     names = [name] if name else [weights.name for weights in ALL if installed(weights.name)]
     if not names:

@@ -64,7 +64,7 @@ def scale_from(config: Config) -> str:
     """Where metres come from, for people. Raises WeightsError where the settings' weights are not installed."""
     if needs_depth(config):
         return "the depth topics, m"
-    from garps_core.models.store import default  # networks cost nothing where none is used
+    from garps_core.weights.store import default  # networks cost nothing where none is used
 
     settings = config.reconstruction
     if settings.method == "two_view":
@@ -83,7 +83,7 @@ def scale_from(config: Config) -> str:
 
 def two_view_name(config: Config) -> str:
     """The two-view network of the settings, and its weights, in words."""
-    from garps_core.models.store import default
+    from garps_core.weights.store import default
 
     start = config.start
     if start.method == "adapter":
@@ -102,7 +102,7 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
     two_view = config.start.method in TWO_VIEW
     if needs_depth(config) and settings.semantics == "none" and not two_view:
         return
-    from garps_core.models import loaded  # networks cost nothing where none is used
+    from garps_core.models import loaded
 
     if two_view:
         from garps_core.models.pairs import two_view_model

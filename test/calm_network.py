@@ -6,7 +6,7 @@ from pathlib import Path
 import golden_rule
 import torch
 
-from garps_core.models.manifest import BY_NAME
+from garps_core.weights.manifest import BY_NAME
 
 NAME = "depth-anything-v2-indoor-small"
 SETTINGS = ["reconstruction.method=depth_anything_v2", "reconstruction.depth_scale=0.25"]

@@ -17,8 +17,8 @@ from test_cli import TRUTH, K, room
 from torch import nn
 
 from garps_core import View
-from garps_core.models.manifest import BY_NAME
 from garps_core.models.two_view import Architecture, Stack, TwoView
+from garps_core.weights.manifest import BY_NAME
 
 DEPTH, FLASH3D, BACKBONE = "depth-anything-v2-indoor-small", "flash3d", "dinov2-small"
 GOLDEN = {

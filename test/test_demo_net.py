@@ -19,8 +19,8 @@ from garps_core.doctor import examine
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import demo_net, loaded
 from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
-from garps_core.models.files import read_tensors
 from garps_core.reconstruct import with_depth
+from garps_core.weights.reader import read_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).resolve().parent.parent

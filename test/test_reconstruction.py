@@ -18,8 +18,8 @@ from garps_core import Config, Status, View, cli, estimate_relative_pose, recons
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.models import depth_anything, loaded
 from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of
-from garps_core.models.manifest import BY_NAME
 from garps_core.reconstruct import with_depth
+from garps_core.weights.manifest import BY_NAME
 
 MONOCULAR = Config.preset("monocular")
 LAST_BIAS = "depth_head.scratch.output_conv2.2.bias"

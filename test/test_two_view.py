@@ -18,7 +18,6 @@ from safetensors.torch import save_file
 from bench.two_view import counted, measured, random_network, stages
 from garps_core.errors import InputError, WeightsError
 from garps_core.models.convert import needed
-from garps_core.models.files import read_tensors
 from garps_core.models.two_view import (
     Architecture,
     CrossAttention,
@@ -29,6 +28,7 @@ from garps_core.models.two_view import (
     rotated,
     rotation,
 )
+from garps_core.weights.reader import read_tensors
 
 MAST3R, DPT, LINEAR = TWO_VIEW
 FULL = "mast3r_full"

@@ -22,10 +22,10 @@ from garps_core import Config, cli
 from garps_core.config import PRESETS
 from garps_core.config.start import TWO_VIEW
 from garps_core.models import depth_anything, pairs
-from garps_core.models.files import read_tensors
-from garps_core.models.manifest import ALL, BY_NAME, SHARE_ALIKE
 from garps_core.models.mask2former import Mask2Former
 from garps_core.models.naver import NaverModel
+from garps_core.weights.manifest import ALL, BY_NAME, SHARE_ALIKE
+from garps_core.weights.reader import read_tensors
 
 MAST3R, PTH = "mast3r", "mast3r-pth"
 DUST3R = ("dust3r-dpt", "dust3r-linear", "dust3r-linear-224")

@@ -26,8 +26,8 @@ def name(path: Path) -> str:
 
 
 PACKAGE_FILES = sources(*PACKAGES)
-WEIGHTS_READER = ROOT / "garps_core/models/files.py"
-WEIGHTS_FETCHER = ROOT / "garps_core/models/fetch.py"
+WEIGHTS_READER = ROOT / "garps_core/weights/reader.py"
+WEIGHTS_FETCHER = ROOT / "garps_core/weights/fetch.py"
 ALL_FILES = [*PACKAGE_FILES, *sources("bench", "test"), ROOT / "setup.py"]
 
 

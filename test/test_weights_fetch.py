@@ -20,9 +20,9 @@ from test_weights_files import Marks
 
 from garps_core import cli
 from garps_core.errors import WeightsError
-from garps_core.models import store
-from garps_core.models.fetch import fetch
-from garps_core.models.verify import verify
+from garps_core.weights import store
+from garps_core.weights.fetch import fetch
+from garps_core.weights.verify import verify
 
 pytest.importorskip("huggingface_hub")
 

@@ -17,8 +17,8 @@ from safetensors.torch import save_file
 from torch import nn
 
 from garps_core.errors import WeightsError
-from garps_core.models import files, manifest, store
-from garps_core.models.files import read_tensors
+from garps_core.weights import manifest, reader, store
+from garps_core.weights.reader import read_tensors
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.ones(2), "n": torch.tensor(3)}
 
@@ -220,7 +220,7 @@ HOSTILE: dict[Callable[[Path, Path], None], str] = {
 def test_a_hostile_file_is_refused_without_effect(
     make: Callable[[Path, Path], None], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "MAX_ENTRIES", 40)
+    monkeypatch.setattr(reader, "MAX_ENTRIES", 40)
     path, marker = folder / "model.pth", tmp_path / "marker"
     make(path, marker)
     with pytest.raises(WeightsError) as caught:
@@ -244,7 +244,7 @@ def test_these_files_would_have_done_harm(make: Callable[[Path, Path], None], tm
 def test_size_hash_and_record_are_checked(folder: Path) -> None:
     path = folder / "model.safetensors"
     save_file(TENSORS, path)
-    size, digest = path.stat().st_size, files.hash_of(path)
+    size, digest = path.stat().st_size, reader.hash_of(path)
     assert read_tensors(path, max_bytes=size, sha256=digest).sha256 == digest
     with pytest.raises(WeightsError, match=f"has {size} bytes: expected at most {size - 1}"):
         read_tensors(path, max_bytes=size - 1)
@@ -263,7 +263,7 @@ def test_the_parts_of_a_torch_file_are_bounded(
 ) -> None:
     torch.save(TENSORS, tmp_path / "a.pth")
     read_tensors(tmp_path / "a.pth")
-    monkeypatch.setattr(files, bound, 50)
+    monkeypatch.setattr(reader, bound, 50)
     with pytest.raises(WeightsError, match=expected):
         read_tensors(tmp_path / "a.pth")
 
@@ -273,24 +273,24 @@ def test_a_large_directory_is_seen_in_both_kinds_of_zip(tmp_path: Path) -> None:
     plain = tmp_path / "plain.zip"
     with zipfile.ZipFile(plain, "w") as archive:
         archive.writestr("a", b"")
-    size = files._directory_bytes(plain)
+    size = reader._directory_bytes(plain)
     assert size == 46 + len("a")
     content, end = plain.read_bytes(), plain.read_bytes().rfind(b"PK\x05\x06")
     larger = struct.pack("<4sQHHIIQQQQ", b"PK\x06\x06", 44, 45, 45, 0, 0, 1, 1, 2**40, end - size)
     locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, end, 1)
     plain.write_bytes(content[:end] + larger + locator + content[end:])
-    assert files._directory_bytes(plain) == 2**40
+    assert reader._directory_bytes(plain) == 2**40
 
 
 def test_a_file_that_changes_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, parsed = tmp_path / "a.safetensors", files._parsed
+    path, parsed = tmp_path / "a.safetensors", reader._parsed
     save_file(TENSORS, path)
 
     def disturbed(*arguments: Any) -> Any:
         os.utime(path, ns=(0, 0))
         return parsed(*arguments)
 
-    monkeypatch.setattr(files, "_parsed", disturbed)
+    monkeypatch.setattr(reader, "_parsed", disturbed)
     with pytest.raises(WeightsError, match="changed while it was read"):
         read_tensors(path)
 

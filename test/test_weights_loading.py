@@ -7,7 +7,7 @@ from golden_rule import keys, state
 from torch import nn
 
 from garps_core.errors import WeightsError
-from garps_core.models.loading import kind_of, load_strictly, recognised
+from garps_core.weights.state_dict import kind_of, load_strictly, recognised
 
 
 def network() -> nn.Module:

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 
 from garps_core.errors import WeightsError
-from garps_core.models.files import read_tensors, write_tensors
-from garps_core.models.loading import check_finite, kind_of, recognised
-from garps_core.models.manifest import ALL, MAX_DEPTH_M, Weights, of_file
+from garps_core.weights.manifest import ALL, MAX_DEPTH_M, Weights, of_file
+from garps_core.weights.reader import read_tensors, write_tensors
+from garps_core.weights.state_dict import check_finite, kind_of, recognised
 
 _SIZES = {384: "vits", 768: "vitb", 1024: "vitl", 1536: "vitg"}
 

@@ -24,9 +24,9 @@ from torch.nn import functional as F
 
 from garps_core.checks import Float32Array
 from garps_core.errors import InputError, ModelError
-from garps_core.models.files import read_tensors
-from garps_core.models.loading import load_strictly
 from garps_core.types import View
+from garps_core.weights.reader import read_tensors
+from garps_core.weights.state_dict import load_strictly
 
 HEIGHT, WIDTH = 192, 256
 """Pixels of the network's input; its answer has half as many a side."""

@@ -23,9 +23,9 @@ from garps_core.devices import checked_device
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import vit
 from garps_core.models.dpt import DptHead, Grid, enlarged
-from garps_core.models.loading import load_strictly
-from garps_core.models.manifest import MAX_DEPTH_M
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
+from garps_core.weights.manifest import MAX_DEPTH_M
+from garps_core.weights.state_dict import load_strictly
 
 RGBImage = npt.NDArray[np.uint8]
 

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.errors import WeightsError
-from garps_core.models.loading import load_strictly
 from garps_core.models.resnet import FEATURE_CHANNELS, ResNet50
+from garps_core.weights.state_dict import load_strictly
 
 LAYERS = 2
 HEIGHT, WIDTH = 256, 384

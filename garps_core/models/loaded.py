@@ -20,11 +20,11 @@ from garps_core.devices import checked_device
 from garps_core.errors import ModelError, ReconstructionError, WeightsError
 from garps_core.models import demo_net, mask2former, semantics
 from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
-from garps_core.models.files import Tensors, read_tensors
 from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
-from garps_core.models.manifest import BY_NAME, PERMISSIVE, licence_of, named, of_file, range_of
-from garps_core.models.store import default, installed, weights_folder
 from garps_core.types import View
+from garps_core.weights.manifest import BY_NAME, PERMISSIVE, licence_of, named, of_file, range_of
+from garps_core.weights.reader import Tensors, read_tensors
+from garps_core.weights.store import default, installed, weights_folder
 
 AT_THE_END = 0.98
 """Share of the network's largest depth from which on a pixel is as far as the network can say."""

@@ -32,10 +32,10 @@ from garps_core.models.deformable import (
     sine_positions,
 )
 from garps_core.models.depth_anything import DEVIATION, MEAN, RGBImage, checked_image
-from garps_core.models.loading import load_strictly
 from garps_core.models.semantics import Labels, Scores, best_classes, stretching
 from garps_core.models.vit import PATCH
 from garps_core.models.vit_adapter import COARSEST, AdapterSize, ViTAdapter, adapter_size, counted
+from garps_core.weights.state_dict import load_strictly
 
 GROUPS = 32
 """Of every group normalisation."""

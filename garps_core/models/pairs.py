@@ -11,10 +11,10 @@ from garps_core.config import Config
 from garps_core.config.start import TWO_VIEW
 from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, WeightsError
 from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
-from garps_core.models.manifest import of_file
 from garps_core.models.naver import NaverModel, digest
 from garps_core.models.two_view import TwoView, built_from
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
+from garps_core.weights.manifest import of_file
 
 ADAPTERS = "garps_core.two_view"
 """Entry points of installed packages in this group are adapters: `NAME = "package.module:load"`."""

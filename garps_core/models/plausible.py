@@ -15,9 +15,9 @@ import torch
 
 from garps_core.checks import Float32Array
 from garps_core.errors import WeightsError
-from garps_core.models.files import Tensors, read_tensors
-from garps_core.models.loading import check_finite, kind_of, load_strictly, recognised
-from garps_core.models.manifest import of_file, range_of
+from garps_core.weights.manifest import of_file, range_of
+from garps_core.weights.reader import Tensors, read_tensors
+from garps_core.weights.state_dict import check_finite, kind_of, load_strictly, recognised
 
 Finding = tuple[str, str, bool]
 Picture = npt.NDArray[np.uint8]

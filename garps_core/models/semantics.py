@@ -23,9 +23,9 @@ from torch.nn import functional as F
 from garps_core.checks import Float64Array, IntArray
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models.depth_anything import DEVIATION, DTYPES, MEAN, RGBImage, checked_image
-from garps_core.models.loading import load_strictly
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer, from_transformers, size_of
 from garps_core.types import Mixture
+from garps_core.weights.state_dict import load_strictly
 
 RATIOS = (1.0, 1.32, 1.73)
 """Sizes of the picture that the published multi-scale test merges (some add 2.28 and 3.0)."""

@@ -17,9 +17,9 @@ from torch.nn import functional as F
 
 from garps_core.errors import InputError, WeightsError
 from garps_core.models.dpt import Grid
-from garps_core.models.loading import load_strictly, recognised
 from garps_core.models.two_view_heads import PATCH, DenseHead, LinearHead, ViewMaps, without_aliases
 from garps_core.models.vit import EPSILON, Mlp
+from garps_core.weights.state_dict import load_strictly, recognised
 
 BASE = 100.0
 """Of the rotations: from 1 radian per patch down to nearly 1/BASE."""

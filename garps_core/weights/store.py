@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from garps_core.errors import WeightsError
-from garps_core.models.manifest import ALL, Weights, named
+from garps_core.weights.manifest import ALL, Weights, named
 
 CHECKSUMS = "checksums.json"
 _MAX_BYTES = 2**20  # of that file

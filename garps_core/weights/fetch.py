@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from garps_core.errors import WeightsError
-from garps_core.models.manifest import Weights, named
-from garps_core.models.store import Record, installed, record, recorded, weights_folder
-from garps_core.models.verify import examined, verify
+from garps_core.weights.manifest import Weights, named
+from garps_core.weights.store import Record, installed, record, recorded, weights_folder
+from garps_core.weights.verify import examined, verify
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weights files of others that GARPS knows: name, licence, where they come from. It ships none of them.
 
-No checksum is known in advance: the first fetch or verification records it (`garps_core.models.store`), and from then
+No checksum is known in advance: the first fetch or verification records it (`garps_core.weights.store`), and from then
 on it is checked.
 """
 

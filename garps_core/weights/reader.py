@@ -24,8 +24,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from garps_core.errors import WeightsError
-from garps_core.models.manifest import NEEDS_NAMESPACE
-from garps_core.models.store import CHECKSUMS, recorded, weights_folder
+from garps_core.weights.manifest import NEEDS_NAMESPACE
+from garps_core.weights.store import CHECKSUMS, recorded, weights_folder
 
 MAX_BYTES = 8 * 2**30
 """Default bound of a file: the largest network that is known, with room."""

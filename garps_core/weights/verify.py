@@ -6,10 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from garps_core.errors import WeightsError
-from garps_core.models.files import Tensors, read_tensors
-from garps_core.models.loading import kind_of, recognised
-from garps_core.models.manifest import Weights, named
-from garps_core.models.store import Record, installed, record, recorded, weights_folder
+from garps_core.weights.manifest import Weights, named
+from garps_core.weights.reader import Tensors, read_tensors
+from garps_core.weights.state_dict import kind_of, recognised
+from garps_core.weights.store import Record, installed, record, recorded, weights_folder
 
 
 def verify(name: str) -> str:
