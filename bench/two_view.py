@@ -24,7 +24,7 @@ from bench.networks import counted_flop
 from bench.networks_pair import peak_mib, seconds_of
 from bench.speed_parts import Check, Row, Section, markdown
 from bench.tables import machine_facts
-from garps_core.models.naver import NaverModel, prepared
+from garps_core.models.mast3r import NaverModel, prepared
 from garps_core.models.two_view import Architecture, Stack, TwoView
 
 Call = Callable[[], Any]

@@ -30,9 +30,9 @@ def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tup
         config: `start.method` must be a two-view network.
     Raises:
         InitialisationError: a map has hardly a point in front of its camera, or tells of no focal length there is.
-        ConfigError, WeightsError, ModelError: as `garps_core.models.pairs.pair_maps`.
+        ConfigError, WeightsError, ModelError: as `garps_core.models.two_view_in_use.pair_maps`.
     """
-    from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
+    from garps_core.models.two_view_in_use import pair_maps  # networks cost nothing where none is used
 
     maps = pair_maps(source, target, config)
     return intrinsics_of(maps, (source.shape[:2], target.shape[:2]), config.start.min_confidence)

@@ -56,7 +56,7 @@ def initialise(
 
 
 def _by_network(source: View, target: View, config: Config) -> Prior:
-    from garps_core.models.pairs import pair_maps  # networks cost nothing where none is used
+    from garps_core.models.two_view_in_use import pair_maps  # networks cost nothing where none is used
 
     try:
         maps = pair_maps(source.rgb, target.rgb, config)

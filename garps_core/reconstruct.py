@@ -60,10 +60,10 @@ def with_depth(views: Sequence[View], config: Config) -> list[View]:
     if not needing or method == "rgbd":
         return list(views)
     check_settings(config)
-    from garps_core.models import loaded
+    from garps_core.models import in_use
 
     try:
-        depths = loaded.depths([views[i] for i in needing], config)
+        depths = in_use.depths([views[i] for i in needing], config)
     except WeightsError as error:
         if method != "auto":
             raise
@@ -88,7 +88,7 @@ def depth_origin(views: Sequence[View], config: Config) -> str:
 
 
 def _of_pair(views: Sequence[View], config: Config) -> list[View]:
-    from garps_core.models.pairs import pair_maps
+    from garps_core.models.two_view_in_use import pair_maps
 
     if len(views) != 2:
         raise ConfigError(
@@ -123,15 +123,15 @@ def mixture_of(view: View, config: Config) -> Mixture:
     mixture = None if settings.method == "flash3d" else lift(view, config.lifting)
     if mixture is not None and settings.semantics == "none":
         return mixture
-    from garps_core.models import loaded
+    from garps_core.models import in_use
     from garps_core.models.flash3d_mixture import gaussians_to_mixture, predict_gaussians
     from garps_core.models.semantics import labelled
 
-    labels = None if settings.semantics == "none" else loaded.labels(view.rgb, config)
+    labels = None if settings.semantics == "none" else in_use.labels(view.rgb, config)
     if mixture is not None:
         return mixture if labels is None else labelled(mixture, labels, view.K)
     gaussians = predict_gaussians(
-        loaded.flash3d(settings.flash3d_weights, config.device), view, settings.drop_border, loaded.dtype_of(config)
+        in_use.flash3d(settings.flash3d_weights, config.device), view, settings.drop_border, in_use.dtype_of(config)
     )
     published = config.alignment.solver == "adam"
     return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not published)

@@ -125,7 +125,7 @@ def check(file: File, variant: Variant = "", kind: Kind = None) -> int:
     \b
     Exit code: 0 = all is plausible, 1 = something is not.
     """
-    from garps_core.models.plausible import check_file
+    from garps_core.models.check import check_file
 
     healthy = True
     for name, finding, good in check_file(file, variant=variant, kind=kind):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is settled before the first pair, live and offline: whose depth it is, networks loaded, loops compiled."""
+"""What is settled before the first pair, live and offline: whose depth it is, networks in_use, loops compiled."""
 
 from __future__ import annotations
 
@@ -102,22 +102,22 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
     two_view = config.start.method in TWO_VIEW
     if needs_depth(config) and settings.semantics == "none" and not two_view:
         return
-    from garps_core.models import loaded
+    from garps_core.models import in_use
 
     if two_view:
-        from garps_core.models.pairs import two_view_model
+        from garps_core.models.two_view_in_use import two_view_model
 
         names.append(two_view_name(config))
         two_view_model(config)
     if not needs_depth(config) and settings.method != "two_view":
         names.append(scale_from(config).removesuffix(", m"))
-        loaded.on_device(loaded.depth_network_of(settings), config.device)
+        in_use.on_device(in_use.depth_network_of(settings), config.device)
     if settings.method == "flash3d":
-        loaded.flash3d(settings.flash3d_weights, config.device)
+        in_use.flash3d(settings.flash3d_weights, config.device)
     if settings.semantics != "none":
         names.append(f"labels ({settings.semantics})")
-        segmenter = loaded.segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
-        loaded.on_device(segmenter, config.device)
+        segmenter = in_use.segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
+        in_use.on_device(segmenter, config.device)
     say(f"loaded {' and '.join(names)} in {time.perf_counter() - begin:.1f} s")
 
 

@@ -23,7 +23,7 @@ from bench.pnp import Failure, features_pnp_oneway
 from bench.rooms import make_pair
 from garps_core import View, metrics
 from garps_core.geometry import transform
-from garps_core.models import pairs
+from garps_core.models import two_view_in_use
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 WITHIN_M = {
@@ -126,7 +126,7 @@ def test_a_network_that_is_not_installed_is_a_reason(name, pair, tmp_path, monke
 def test_a_network_of_random_parameters_knows_no_pose(name, pair, tmp_path, monkeypatch) -> None:
     install_reduced(tmp_path, "mast3r", "dust3r-dpt")
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
-    monkeypatch.setattr(pairs, "NaverModel", partial(pairs.NaverModel, long_side=128))
+    monkeypatch.setattr(two_view_in_use, "NaverModel", partial(two_view_in_use.NaverModel, long_side=128))
     T, reason = METHODS[name](pair.source, pair.target, None)
     assert T is None and "trusted pixels fit one pose: expected at least 20%" in reason
 
@@ -135,7 +135,7 @@ def test_a_network_of_random_parameters_knows_no_pose(name, pair, tmp_path, monk
 def test_a_network_that_tells_the_truth_is_believed(name, pair, monkeypatch) -> None:
     maps = point_maps((pair.source, pair.target), pair.T_target_source)
     told = dataclasses.replace(maps, metric=name == "mast3r")
-    monkeypatch.setattr(pairs, "pair_maps", lambda *_: told)
+    monkeypatch.setattr(two_view_in_use, "pair_maps", lambda *_: told)
     T, reason = METHODS[name](pair.source, pair.target, None)
     assert T is not None, reason
     assert e_3d_m(T, pair) < 0.01

@@ -17,7 +17,7 @@ from garps_core import Config, View, cli, estimate_relative_pose, metrics
 from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
 from garps_core.doctor import examine
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
-from garps_core.models import demo_net, loaded
+from garps_core.models import demo_net, in_use
 from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
 from garps_core.reconstruct import with_depth
 from garps_core.weights.reader import read_tensors
@@ -156,7 +156,7 @@ def test_it_is_called_a_demonstration(
 ) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # loaded anew
     with caplog.at_level(logging.WARNING, "garps_core"):
-        assert isinstance(loaded.demonstration(), DemoNet)
+        assert isinstance(in_use.demonstration(), DemoNet)
     assert f"demo_net is {DEMONSTRATION}" in caplog.text
     rows, _ = examine()
     assert DEMONSTRATION in dict(rows)["demo_net"]

@@ -13,7 +13,7 @@ from test_mask2former import ADAPTER, HEAD, random_state
 
 from garps_core import Config, Prior, align_mixtures, cli, metrics, reconstruct
 from garps_core.geometry import se3_exp
-from garps_core.models import depth_anything, loaded
+from garps_core.models import depth_anything, in_use
 from garps_core.models.flash3d import PADDED
 from garps_core.models.flash3d_mixture import labels_of, predict_gaussians
 from garps_core.models.mask2former import Mask2Former
@@ -44,7 +44,7 @@ def installed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    return loaded.depth_network("", "any"), loaded.flash3d("", "cpu")
+    return in_use.depth_network("", "any"), in_use.flash3d("", "cpu")
 
 
 def test_two_pictures_by_flash3d(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
@@ -112,7 +112,7 @@ def test_mistakes_are_one_line(files: dict[str, str], words: list[str], message:
 def test_a_lifted_component_has_the_label_of_its_pixel(head: str) -> None:
     (view,) = pair(depth=True)[:1]
     mixture = reconstruct(view, Config().replace({"reconstruction.semantics": head}))
-    labels = segment(loaded.segmenter(head, "", ""), view.rgb)
+    labels = segment(in_use.segmenter(head, "", ""), view.rgb)
     assert len(np.unique(labels)) > 1 and labels.shape == view.rgb.shape[:2]
     pixels = mixture.means[:, :2] / mixture.means[:, 2:] * (view.K[0, 0], view.K[1, 1]) + view.K[:2, 2]
     column, row = np.rint(pixels).astype(int).T
@@ -126,11 +126,11 @@ def test_both_gaussians_of_a_pixel_have_its_label() -> None:
     config = Config.preset("paper").replace(changes)
     (view,) = with_depth(pair()[:1], config)
     mixture = mixture_of(view, config)
-    gaussians = predict_gaussians(loaded.flash3d("", "cpu"), view)
+    gaussians = predict_gaussians(in_use.flash3d("", "cpu"), view)
     kept = (gaussians.means[:, 2] >= config.lifting.min_range_m) & (gaussians.opacities >= 1 / 255)
     np.testing.assert_array_equal(mixture.means, gaussians.means[kept])
     pixel = gaussians.index[kept] % (PADDED[0] * PADDED[1])
-    expected = labels_of(segment(loaded.segmenter("linear", "", ""), view.rgb), view, pixel)
+    expected = labels_of(segment(in_use.segmenter("linear", "", ""), view.rgb), view, pixel)
     np.testing.assert_array_equal(mixture.labels, expected)
     of_pixel = np.full(PADDED[0] * PADDED[1], -1)
     of_pixel[pixel] = mixture.labels
@@ -158,9 +158,9 @@ def test_heads_take_the_backbone_that_is_there(weights: Path, tmp_path: Path, mo
             (weights / name.replace("-small-hf.safetensors", "_vits14_pretrain.pth")).read_bytes()
         )
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
-    assert loaded.segmenter("linear", "", "").taps == (11,)
+    assert in_use.segmenter("linear", "", "").taps == (11,)
     file = str(weights / "dinov2_vits14_pretrain.pth")
-    assert loaded.segmenter("linear", "", file).taps == (11,)
+    assert in_use.segmenter("linear", "", file).taps == (11,)
 
 
 @pytest.fixture(scope="module")

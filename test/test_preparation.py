@@ -12,7 +12,7 @@ from ros_messages import camera_info, image
 from garps_core import Config, estimate_relative_pose
 from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
-from garps_core.models import depth_anything, loaded
+from garps_core.models import depth_anything, in_use
 from garps_ros import preparation, replay
 from garps_ros.assembly import DEPTH, IMAGE, Assembly
 from garps_ros.cameras import CameraTopics, Frame
@@ -47,7 +47,7 @@ def installed(weights, monkeypatch):
 def passes():
     """How many pictures enter the network, pass by pass."""
     entered = []
-    hook = loaded.depth_network("", "any").register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
+    hook = in_use.depth_network("", "any").register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
     yield entered
     hook.remove()
 

@@ -16,7 +16,7 @@ from test_cli import K
 
 from garps_core import Config, Status, View, cli, estimate_relative_pose, reconstruct
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.models import depth_anything, loaded
+from garps_core.models import depth_anything, in_use
 from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of
 from garps_core.reconstruct import with_depth
 from garps_core.weights.manifest import BY_NAME
@@ -43,7 +43,7 @@ def asked(preset: Config = MONOCULAR, **changes: object) -> Config:
 
 
 def network() -> depth_anything.DepthAnythingV2:
-    return loaded.depth_network("", "any")
+    return in_use.depth_network("", "any")
 
 
 @pytest.mark.parametrize("preset", ["sensor", "monocular"])
@@ -125,7 +125,7 @@ def test_threads_that_want_a_network_at_once_load_it_once() -> None:
     loads: list[str] = []
     gate = threading.Barrier(4)
 
-    @loaded.once
+    @in_use.once
     def load(name: str) -> str:
         loads.append(name)
         threading.Event().wait(0.05)
@@ -166,7 +166,7 @@ def test_the_size_of_a_network_is_that_of_its_tensors(tmp_path: Path, weights: P
     """Whatever its name says: here Small under the name of Base."""
     path = tmp_path / BY_NAME["depth-anything-v2-indoor-base"].local
     path.symlink_to(weights / BY_NAME[DEPTH].local)
-    assert loaded.depth_network(str(path), "any").head == HEADS["vits"]
+    assert in_use.depth_network(str(path), "any").head == HEADS["vits"]
 
 
 def test_a_relative_model_is_refused_by_its_name(tmp_path: Path, weights: Path) -> None:
@@ -243,7 +243,7 @@ def test_weights_that_do_not_fit_a_device_are_no_crash() -> None:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
     with pytest.raises(ModelError, match="out of memory on cpu for the weights of Full"):
-        loaded.on_device(Full(), "cpu")
+        in_use.on_device(Full(), "cpu")
 
 
 def test_values_that_are_no_numbers_are_no_mixture_and_damaged_weights_an_error(tmp_path: Path) -> None:

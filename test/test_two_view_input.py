@@ -14,8 +14,8 @@ from network_weights import TWO_VIEW, two_view_architecture, two_view_tensors
 from safetensors.torch import save_file
 
 from garps_core.errors import ConfigError, InputError, ModelError
-from garps_core.models.naver import KEPT, NaverModel, prepared, prepared_square
-from garps_core.models.plausible import check_file
+from garps_core.models.check import check_file
+from garps_core.models.mast3r import KEPT, NaverModel, prepared, prepared_square
 from garps_core.models.two_view import Architecture, Stack, TwoView, built_from
 from garps_core.point_maps import PairMaps, PointMap, TwoViewModel
 

@@ -21,9 +21,9 @@ from test_mask2former import ADAPTER, HEAD, random_state
 from garps_core import Config, cli
 from garps_core.config import PRESETS
 from garps_core.config.start import TWO_VIEW
-from garps_core.models import depth_anything, pairs
+from garps_core.models import depth_anything, two_view_in_use
 from garps_core.models.mask2former import Mask2Former
-from garps_core.models.naver import NaverModel
+from garps_core.models.mast3r import NaverModel
 from garps_core.weights.manifest import ALL, BY_NAME, SHARE_ALIKE
 from garps_core.weights.reader import read_tensors
 
@@ -64,7 +64,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 def installed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All are there, and look at small pictures."""
     monkeypatch.setenv("GARPS_WEIGHTS", str(weights))
-    monkeypatch.setattr(pairs, "NaverModel", partial(NaverModel, long_side=128))
+    monkeypatch.setattr(two_view_in_use, "NaverModel", partial(NaverModel, long_side=128))
 
 
 def depths(files: Files, target: str = "b") -> list[str]:
@@ -103,7 +103,7 @@ NO_FIT = "trusted pixels fit one pose: expected at least 20%"
 @pytest.mark.parametrize("name", [MAST3R, PTH])
 def test_two_pictures_and_nothing_else(files: Files, name: str, capsys: Captured) -> None:
     """Depth of both views and a try at the pose from one look at the pair; both layouts say the same."""
-    network = pairs.two_view_model(Config.preset("mast3r").replace({"start.weights": name})).network
+    network = two_view_in_use.two_view_model(Config.preset("mast3r").replace({"start.weights": name})).network
     with passes(network.patch_embed) as seen:
         out = aligned(capsys, files, "--preset", "mast3r", *K_WORDS, *with_weights(f"weights={name}"))
         assert seen == [(2, 3, 96, 128)]
@@ -318,7 +318,7 @@ def test_the_licence_is_told_as_weights_are_loaded(
     for name in (MAST3R, PTH, *DUST3R, str(tmp_path / "renamed.safetensors")):
         kind = BY_NAME[name].kind if name in BY_NAME else MAST3R
         with caplog.at_level(logging.WARNING, "garps_core"):
-            pairs.two_view_model(Config().replace({"start.method": kind, "start.weights": name}))
+            two_view_in_use.two_view_model(Config().replace({"start.method": kind, "start.weights": name}))
         (told,) = [record for record in caplog.records if record.name == "garps_core"]
         assert told.levelno == logging.WARNING
         file = BY_NAME[name].local if name in BY_NAME else "renamed.safetensors"
@@ -343,7 +343,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
     def opened(*given: object) -> None:
         pytest.fail(f"asked for {given}")
 
-    monkeypatch.setattr(pairs, "tensors_of", opened)
+    monkeypatch.setattr(two_view_in_use, "tensors_of", opened)
     for name in PRESETS:
         if name not in ("mast3r", "paper", "paper_full"):
             assert cli.main(["align", files["a"], files["b"], *K_WORDS, *depths(files), "--preset", name]) in (0, 1)

@@ -11,9 +11,9 @@ from safetensors.torch import save_file
 
 from garps_core import cli
 from garps_core.errors import WeightsError
+from garps_core.models.check import drawn_room
 from garps_core.models.convert import needed
 from garps_core.models.mask2former import HeadSize, Mask2Former
-from garps_core.models.plausible import drawn_room
 from garps_core.models.vit_adapter import AdapterSize
 from garps_core.weights.reader import hash_of, read_tensors
 

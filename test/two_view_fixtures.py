@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from garps_core.errors import ModelError, WeightsError
-from garps_core.models.naver import digest
+from garps_core.models.mast3r import digest
 from garps_core.point_maps import Framing, PairMaps, Picture, PointMap
 
 RECORDED = "recorded"

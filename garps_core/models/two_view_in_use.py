@@ -10,8 +10,8 @@ from importlib.metadata import entry_points
 from garps_core.config import Config
 from garps_core.config.start import TWO_VIEW
 from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, WeightsError
-from garps_core.models.loaded import DTYPE, on_device, once, tensors_of
-from garps_core.models.naver import NaverModel, digest
+from garps_core.models.in_use import DTYPE, on_device, once, tensors_of
+from garps_core.models.mast3r import NaverModel, digest
 from garps_core.models.two_view import TwoView, built_from
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
 from garps_core.weights.manifest import of_file

@@ -120,7 +120,7 @@ def _likeness_finding(likeness: float, true: Float32Array) -> Finding:
 
 def _two_view(found: Tensors, variant: str) -> Iterator[Finding]:
     """From a part of the drawn room and another that is SHIFT_PX further right and down."""
-    from garps_core.models.naver import NaverModel
+    from garps_core.models.mast3r import NaverModel
     from garps_core.models.two_view import built_from
 
     model = NaverModel(built_from(found.tensors), variant)
