@@ -67,8 +67,8 @@ def depth_anything(case: Case) -> tuple[Call, str]:
 
 def flash3d(case: Case) -> tuple[Call, str]:
     """Flash3D on depth that is there, up to the list of Gaussians; one image at a time."""
+    from garps_core.mixtures.flash3d import predict_gaussians
     from garps_core.models.flash3d import PADDED, Flash3D, flash3d_network
-    from garps_core.models.flash3d_mixture import predict_gaussians
     from garps_core.types import View
 
     network = flash3d_network(Flash3D().state_dict())

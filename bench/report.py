@@ -18,8 +18,9 @@ from bench.plots import write_plots
 from bench.sources import with_depth_of
 from bench.statistics_blocks import pair_of
 from bench.tables import GARPS, START, Row, print_tables, write
-from garps_core import Config, reconstruct
+from garps_core import Config
 from garps_core.figure import before_after
+from garps_core.mixtures import reconstruct
 
 MAX_PICTURES = 8
 

@@ -27,7 +27,7 @@ from bench.readers.pair_list import RAW
 from bench.readers.sfm_scale import SOURCE
 from bench.sources import DEPTHS, MONOCULAR, SENSOR
 from garps_core import Config, GarpsError, View
-from garps_core.reconstruct import with_depth
+from garps_core.mixtures.reconstruct import with_depth
 
 NETWORKS = tuple(name for name in DEPTHS if name not in (SENSOR, MONOCULAR))
 MAX_MM = 65535

@@ -16,8 +16,8 @@ from bench.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread,
 from bench.readers import READERS, load
 from bench.readers.pair_list import RAW
 from garps_core import Config, GarpsError
+from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models.in_use import depth_network_of
-from garps_core.reconstruct import with_depth
 
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
 NAMES = (PAIRS, ROOMS, BARE, *READERS)

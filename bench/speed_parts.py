@@ -17,7 +17,8 @@ from rich.progress import track
 from rich.table import Table
 
 from bench.datasets import Pair, disturbed_prior
-from garps_core import Config, Mixture, Prior, reconstruct
+from garps_core import Config, Mixture, Prior
+from garps_core.mixtures import reconstruct
 
 Row = dict[str, Any]
 

@@ -4,7 +4,7 @@
 from garps_core.align import align_mixtures, estimate_relative_pose
 from garps_core.config import Config
 from garps_core.errors import ConfigError, GarpsError, InputError, ReconstructionError
-from garps_core.reconstruct import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 
 __all__ = [

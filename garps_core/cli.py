@@ -25,8 +25,8 @@ from garps_core.errors import GarpsError, InitialisationError, InputError, Model
 from garps_core.files import read_image, read_view
 from garps_core.focal import estimate_intrinsics
 from garps_core.initialise import identity
+from garps_core.mixtures.splat_reader import read_splats
 from garps_core.report import as_json, as_text
-from garps_core.splat_reader import read_splats
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.weights_cli import app as weights_app
 
@@ -283,7 +283,7 @@ def _write_extras(
         print("garps: note: no pose, so no picture and no PLY files are written", file=sys.stderr)
         return
     if ply is not None:
-        from garps_core.splats import write_aligned
+        from garps_core.mixtures.splat_writer import write_aligned
 
         write_aligned(*mixtures, estimate.T_target_source, ply)
     if figure is not None:

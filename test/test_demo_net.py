@@ -17,9 +17,9 @@ from garps_core import Config, View, cli, estimate_relative_pose, metrics
 from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
 from garps_core.doctor import examine
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
+from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models import demo_net, in_use
 from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
-from garps_core.reconstruct import with_depth
 from garps_core.weights.reader import read_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -12,8 +12,7 @@ import torch
 from garps_core import Mixture
 from garps_core.config.lifting import Lifting
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.models.flash3d import Flash3D, GaussianMaps, flash3d_network, flash3d_tensors
-from garps_core.models.flash3d_mixture import (
+from garps_core.mixtures.flash3d import (
     Flash3DGaussians,
     covariances_of,
     flash3d_input,
@@ -23,6 +22,7 @@ from garps_core.models.flash3d_mixture import (
     predict_gaussians,
     unprojected,
 )
+from garps_core.models.flash3d import Flash3D, GaussianMaps, flash3d_network, flash3d_tensors
 from garps_core.models.resampling import lanczos, nearest_index
 from garps_core.types import View
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from surfaces import off, room
 
-from garps_core import Config, align, reconstruct, search
+from garps_core import Config, align, search
 from garps_core.glance import PURSUED, glances
 from garps_core.initialise import identity
+from garps_core.mixtures import reconstruct
 
 KNOWN = align._known(identity(Config(), ""), Config())
 AROUND = search.beginnings(KNOWN, search.FINE_RINGS)

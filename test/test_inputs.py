@@ -19,10 +19,10 @@ from garps_core import (
     View,
     align_mixtures,
     estimate_relative_pose,
-    reconstruct,
 )
 from garps_core.config import Alignment, Rung
 from garps_core.config.lifting import Lifting
+from garps_core.mixtures import reconstruct
 
 RGB = np.zeros((48, 64, 3), np.uint8)
 K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])

@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
-from garps_core import Config, Prior, Status, align_mixtures, reconstruct, solve
+from garps_core import Config, Prior, Status, align_mixtures, solve
 from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, shared_errors
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
 from garps_core.joint import MODES, backward_jacobian, corrected, evaluate_at, evaluate_jointly
+from garps_core.mixtures import reconstruct
 from garps_core.objective import evaluate, row_information
 from garps_core.pairing import pair_up, to_cloud
 from garps_core.solve import two_way

@@ -11,15 +11,16 @@ from network_weights import GOLDEN, install, pair, passes, write_pair
 from test_cli import K_WORDS, START, TRUTH
 from test_mask2former import ADAPTER, HEAD, random_state
 
-from garps_core import Config, Prior, align_mixtures, cli, metrics, reconstruct
+from garps_core import Config, Prior, align_mixtures, cli, metrics
 from garps_core.geometry import se3_exp
+from garps_core.mixtures import reconstruct
+from garps_core.mixtures.flash3d import labels_of, predict_gaussians
+from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, with_depth
+from garps_core.mixtures.splat_writer import write_splats
 from garps_core.models import depth_anything, in_use
 from garps_core.models.flash3d import PADDED
-from garps_core.models.flash3d_mixture import labels_of, predict_gaussians
 from garps_core.models.mask2former import Mask2Former
 from garps_core.models.semantics import segment
-from garps_core.reconstruct import mixture_of, mixtures_of, with_depth
-from garps_core.splats import write_splats
 
 MONOCULAR = Config.preset("monocular")
 FLASH3D = MONOCULAR.replace({"reconstruction.method": "flash3d"})

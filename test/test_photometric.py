@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from surfaces import TRUTH, K, flat, grey_at, look, off, room
 
-from garps_core import Config, photometric, reconstruct
+from garps_core import Config, photometric
 from garps_core.depth_errors import shared_sigmas
-from garps_core.frustum import brightness_of
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
+from garps_core.mixtures import reconstruct
+from garps_core.mixtures.frustum import brightness_of
 from garps_core.photometric import sharpen
 
 SCENE = {"camera": np.diag([2, 2, 1]) @ K, "size": (240, 320)}

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import SIZE, K, grey_at, look
 
-from garps_core import Config, View, reconstruct
+from garps_core import Config, View
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
-from garps_core.frustum import FRUSTUM_STEP_PX
 from garps_core.geometry import pixel_rays, project
+from garps_core.mixtures import reconstruct
+from garps_core.mixtures.frustum import FRUSTUM_STEP_PX
 from garps_core.pairing import to_cloud, visible
 
 UNSMOOTHED = Config().replace({"lifting.smoothing_px": 0})

@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose, reconstruct, search, solve
+from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose, search, solve
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.initialise import identity
+from garps_core.mixtures import reconstruct
 from garps_core.pairing import to_cloud
 from garps_core.state import Belief
 

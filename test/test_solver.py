@@ -17,7 +17,7 @@ from garps_core import Config
 from garps_core.align import estimate_relative_pose
 from garps_core.errors import InputError
 from garps_core.geometry import se3_inverse
-from garps_core.reconstruct import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.types import PoseEstimate, Prior, Status
 from garps_ros import solver
 from garps_ros.cameras import CameraTopics, Frame

@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_splats import random_mixture
 
-from garps_core import Config, reconstruct
+from garps_core import Config
 from garps_core.errors import InputError
-from garps_core.splat_reader import NEEDED, read_splats
-from garps_core.splats import SH_CONSTANT, write_splats
+from garps_core.mixtures import reconstruct
+from garps_core.mixtures.splat_reader import NEEDED, read_splats
+from garps_core.mixtures.splat_writer import SH_CONSTANT, write_splats
 from garps_core.types import Mixture, View
 
 plyfile = pytest.importorskip("plyfile")

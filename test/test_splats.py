@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from garps_core.errors import InputError
-from garps_core.splats import FIELDS, SH_CONSTANT, splat_table, write_splats
+from garps_core.mixtures.splat_writer import FIELDS, SH_CONSTANT, splat_table, write_splats
 from garps_core.types import Mixture
 
 

@@ -12,7 +12,8 @@ from bench.datasets import Pair, disturbed_prior, scene_points
 from bench.evaluate import START, evaluate_pair
 from bench.rooms import make_pair
 from bench.variants import VARIANTS, estimate, isotropic, last_rung, without_frustum
-from garps_core import Config, View, estimate_relative_pose, reconstruct
+from garps_core import Config, View, estimate_relative_pose
+from garps_core.mixtures import reconstruct
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

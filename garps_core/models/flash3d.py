@@ -2,7 +2,7 @@
 """Flash3D (Szymanowicz et al., 2024): a picture with metric depth -> two 3D Gaussians per pixel, one behind the other.
 
 Only the part behind the depth network, which may be any; parameters named as in the published file.
-`flash3d_mixture.py` makes the input from a view and a mixture from the output.
+`flash3d.py` makes the input from a view and a mixture from the output.
 
     layer 0 stands on the given depth, layer 1 behind it: depth_1 = depth_0 + exp(clamp(r, -10, 6))
     per pixel and layer: offset (m, camera axes), opacity, sigmas (m), rotation (w, x, y, z), colour harmonics

@@ -18,11 +18,11 @@ from torch import Tensor
 from garps_core.checks import Float32Array, Float64Array, IntArray
 from garps_core.config.lifting import Lifting
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError
-from garps_core.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
+from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
+from garps_core.mixtures.splat_writer import SH_CONSTANT
 from garps_core.models.depth_anything import DTYPES
 from garps_core.models.flash3d import HEIGHT, LAYERS, PAD, PADDED, WIDTH, Flash3D, GaussianMaps
 from garps_core.models.resampling import lanczos, nearest_index
-from garps_core.splats import SH_CONSTANT
 from garps_core.types import Mixture, View
 
 MIN_OPACITY = 1 / 255

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3D Gaussian Splatting PLY file -> Mixture: what `splats.py` writes, and what other programs write in this form.
+"""3D Gaussian Splatting PLY file -> Mixture: what `splat_writer.py` writes, and what other programs write in this form.
 
 Per component x y z, f_dc_0..2 (colour as the constant spherical harmonic), opacity (logit), scale_0..2 (log of the
 sigmas), rot_0..3 (quaternion w, x, y, z, any length); other properties are passed over. The coordinates must be those
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from garps_core.checks import Float32Array, Float64Array, checked_intrinsics
 from garps_core.errors import InputError
-from garps_core.splats import SH_CONSTANT
+from garps_core.mixtures.splat_writer import SH_CONSTANT
 from garps_core.types import MAX_IMAGE_PIXELS, Frustum, Mixture
 
 MAX_HEADER_BYTES = 65536

@@ -19,7 +19,7 @@ from garps_core.checks import Float32Array, Float64Array
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
 from garps_core.errors import ReconstructionError
-from garps_core.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
+from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.types import Mixture, View
 
 Bool = npt.NDArray[np.bool_]

@@ -20,8 +20,8 @@ from garps_core.checks import Float32Array
 from garps_core.config import DEPTH_NETWORKS, Config
 from garps_core.config.combinations import check_settings
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
-from garps_core.frustum import MIN_COMPONENTS
-from garps_core.lift import lift
+from garps_core.mixtures.frustum import MIN_COMPONENTS
+from garps_core.mixtures.lift import lift
 from garps_core.point_maps import own_depth
 from garps_core.types import Mixture, View
 
@@ -123,8 +123,8 @@ def mixture_of(view: View, config: Config) -> Mixture:
     mixture = None if settings.method == "flash3d" else lift(view, config.lifting)
     if mixture is not None and settings.semantics == "none":
         return mixture
+    from garps_core.mixtures.flash3d import gaussians_to_mixture, predict_gaussians
     from garps_core.models import in_use
-    from garps_core.models.flash3d_mixture import gaussians_to_mixture, predict_gaussians
     from garps_core.models.semantics import labelled
 
     labels = None if settings.semantics == "none" else in_use.labels(view.rgb, config)
