@@ -26,7 +26,7 @@ from rich.progress import Progress
 from bench.datasets import Pair, scene_points
 from bench.rooms import RoomPair, make_pair
 from garps_core import Config, View
-from garps_core.features import match_features
+from garps_core.start.features import match_features
 
 SET = "bare_rooms"
 FOLDER = Path("out/bare_rooms")

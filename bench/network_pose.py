@@ -7,7 +7,7 @@ from bench.pnp import Failure
 from garps_core import Config
 from garps_core.checks import Float64Array
 from garps_core.errors import WeightsError
-from garps_core.initialise import initialise
+from garps_core.start.initialise import initialise
 from garps_core.types import View
 
 

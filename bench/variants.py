@@ -18,9 +18,9 @@ from bench.tables import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
 from garps_core.align import best_of
 from garps_core.errors import GarpsError, InitialisationError
-from garps_core.initialise import initialise
 from garps_core.mixtures.reconstruct import mixtures_of, with_depth
 from garps_core.models.semantics import labelled
+from garps_core.start.initialise import initialise
 
 GARPS_NO_FEATURES = "garps-no-features"
 GARPS_PAPER = "garps-paper"

@@ -23,10 +23,10 @@ from garps_core.config.text import changed_config, read_settings
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.files import read_image, read_view
-from garps_core.focal import estimate_intrinsics
-from garps_core.initialise import identity
 from garps_core.mixtures.splat_reader import read_splats
 from garps_core.report import as_json, as_text
+from garps_core.start.initialise import identity
+from garps_core.start.intrinsics import estimate_intrinsics
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.weights_cli import app as weights_app
 

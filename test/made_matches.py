@@ -5,9 +5,9 @@ import numpy as np
 from surfaces import TRUTH, flat, grey_at, look
 
 from garps_core import Config
-from garps_core.features import Matches
 from garps_core.geometry import pixel_rays, project, transform
-from garps_core.pnp import pose_from_matches
+from garps_core.start.features import Matches
+from garps_core.start.match_pose import pose_from_matches
 
 HD = (240, 320)
 CAMERA = np.array([[280.0, 0, 159.5], [0, 280.0, 119.5], [0, 0, 1]])

@@ -8,13 +8,22 @@ import pytest
 from made_matches import BLANK, CAMERA, exact_matches, pose_from
 from surfaces import TRUTH
 
-from garps_core import Config, pnp
-from garps_core.bearings import MIN_LENGTHS, pose_from_bearings, triangulated
+from garps_core import Config
 from garps_core.errors import InitialisationError
 from garps_core.geometry import pixel_rays, project, se3_exp, se3_inverse, se3_log, transform
-from garps_core.match_depth import READINGS_AVERAGE, OneWay, Seen, across, inliers_of, seen_at_likely_depths, whitened
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.pnp import pose_from_matches
+from garps_core.start import match_pose
+from garps_core.start.match_pose import pose_from_matches
+from garps_core.start.ransac import MIN_LENGTHS, pose_from_bearings, triangulated
+from garps_core.start.reprojection import (
+    READINGS_AVERAGE,
+    OneWay,
+    Seen,
+    across,
+    inliers_of,
+    seen_at_likely_depths,
+    whitened,
+)
 
 ASIDE = se3_exp(np.array([0.5, -0.1, 0.1, 0.03, 0.2, -0.02]))
 """Half a metre apart: 20 % of the depth is 10 px and more."""
@@ -152,7 +161,7 @@ def test_bearings_begin_where_more_matches_fit_than_from_pnp(monkeypatch, seed):
     matches = exact_matches(seed, count=80, outliers=30, pixel_noise=0.3, relative_depth_noise=0.5, truth=ASIDE)
     config = settings(0.4)
     found = pose_from(matches, config)
-    monkeypatch.setattr(pnp, "pose_from_bearings", lambda *given: None)
+    monkeypatch.setattr(match_pose, "pose_from_bearings", lambda *given: None)
     inliers = [int(start.reason.split()[3]) for start in (found, pose_from(matches, config))]
     assert inliers[0] >= 45 > inliers[1]
     assert rotation_error_deg(found.T_target_source, ASIDE) < 0.3

@@ -9,10 +9,10 @@ from point_map_cases import point_maps, true_views
 
 from bench.rooms import make_pair
 from garps_core import Config
-from garps_core.descriptors import BORDER_PX, match_descriptors, reciprocal
 from garps_core.errors import InitialisationError
 from garps_core.geometry import se3_inverse, se3_log, transform
-from garps_core.pnp import pose_from_matches
+from garps_core.start.descriptors import BORDER_PX, match_descriptors, reciprocal
+from garps_core.start.match_pose import pose_from_matches
 
 CONFIG = Config.preset("monocular")
 

@@ -8,7 +8,7 @@ from point_map_cases import Errors, point_maps, true_views
 from bench.rooms import make_pair
 from garps_core import View
 from garps_core.errors import InitialisationError
-from garps_core.focal import focal_length, intrinsics_of
+from garps_core.start.intrinsics import focal_length, intrinsics_of
 
 
 def centred(view):

@@ -9,8 +9,8 @@ from surfaces import off, room
 
 from garps_core import Config, align, search
 from garps_core.glance import PURSUED, glances
-from garps_core.initialise import identity
 from garps_core.mixtures import reconstruct
+from garps_core.start.initialise import identity
 
 KNOWN = align._known(identity(Config(), ""), Config())
 AROUND = search.beginnings(KNOWN, search.FINE_RINGS)

@@ -11,11 +11,11 @@ from surfaces import FREE, TRUTH, disturbed, room
 from garps_core import Config, Prior, Status, View, estimate_relative_pose
 from garps_core.config.start import Start
 from garps_core.errors import InitialisationError
-from garps_core.features import match_features
 from garps_core.geometry import inverted, project, se3_exp, se3_inverse, se3_log, transform, twist_from_ros
-from garps_core.initialise import combined, initialise
-from garps_core.match_depth import READINGS_AVERAGE
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
+from garps_core.start.features import match_features
+from garps_core.start.initialise import combined, initialise
+from garps_core.start.reprojection import READINGS_AVERAGE
 
 FEATURES = Config().replace({"start.method": "features"})
 STRICT = Config().replace({"start.identity_fallback": False})

@@ -11,8 +11,8 @@ from bench.rooms import make_pair
 from garps_core import Config, ConfigError, View
 from garps_core.errors import InitialisationError
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform, twist_from_ros
-from garps_core.map_pose import pose_from_maps
 from garps_core.point_maps import Framing, own_depth
+from garps_core.start.point_map_pose import pose_from_maps
 
 CONFIG = Config.preset("monocular")
 LANDSCAPE, PORTRAIT = (320, 240), (240, 320)

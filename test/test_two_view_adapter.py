@@ -18,10 +18,10 @@ from two_view_fixtures import CALLS, FAULTS, RECORDED, installed_here, installed
 from bench.rooms import RoomPair, make_pair
 from garps_core import Config, ConfigError, PoseEstimate, Prior, Status, View, cli, estimate_relative_pose
 from garps_core.errors import WeightsError
-from garps_core.focal import estimate_intrinsics
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, twist_from_ros
-from garps_core.initialise import initialise
 from garps_core.point_maps import PairMaps, PointMap
+from garps_core.start.initialise import initialise
+from garps_core.start.intrinsics import estimate_intrinsics
 from garps_core.types import Mixture
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "two_view_models.md"

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from garps_core.checks import Float32Array
 from garps_core.config import Config
 from garps_core.errors import InitialisationError
-from garps_core.features import Matches, points_at
 from garps_core.geometry import Array
 from garps_core.point_maps import PairMaps, PointMap
+from garps_core.start.features import Matches, points_at
 from garps_core.types import View
 
 STEP_PX = 8

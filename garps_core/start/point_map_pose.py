@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.bearings import ransac
 from garps_core.config import Config
 from garps_core.depth_errors import shared_sigmas
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse, se3_log, transform
-from garps_core.match_depth import MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
-from garps_core.pnp import REFINEMENT_STEPS
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
+from garps_core.start.match_pose import REFINEMENT_STEPS
+from garps_core.start.ransac import ransac
+from garps_core.start.reprojection import MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
 from garps_core.types import Prior, View
 
 STEP_PX = 4

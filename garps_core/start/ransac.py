@@ -11,9 +11,9 @@ import numpy as np
 import poselib
 
 from garps_core.config import Config
-from garps_core.features import Matches
 from garps_core.geometry import Array, pixel_rays
-from garps_core.match_depth import (
+from garps_core.start.features import Matches
+from garps_core.start.reprojection import (
     OneWay,
 )
 

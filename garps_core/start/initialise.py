@@ -9,12 +9,12 @@ import numpy as np
 from garps_core.config import Config
 from garps_core.config.combinations import check_start
 from garps_core.config.start import TWO_VIEW
-from garps_core.descriptors import match_descriptors
 from garps_core.errors import InitialisationError, ModelError, WeightsError
-from garps_core.features import match_features
 from garps_core.geometry import ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
-from garps_core.map_pose import pose_from_maps
-from garps_core.pnp import pose_from_matches
+from garps_core.start.descriptors import match_descriptors
+from garps_core.start.features import match_features
+from garps_core.start.match_pose import pose_from_matches
+from garps_core.start.point_map_pose import pose_from_maps
 from garps_core.types import Prior, View
 
 

@@ -8,20 +8,20 @@ out, and are added through their effect on the pose (`depth_errors.py`).
 
 What depth errors do to a pixel lies along its epipolar line. Where a network's depth is off from place to place
 (`lifting.patch_sigma`), residuals along it count for less, down to the epipolar error alone, and the pose from
-bearings (`bearings.py`) is one more to begin with. Each match's depth is an unknown then (`match_depth.py`).
+bearings (`ransac.py`) is one more to begin with. Each match's depth is an unknown then (`reprojection.py`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from garps_core.bearings import pose_from_bearings, ransac
 from garps_core.config import Config
 from garps_core.depth_errors import shared_sigmas
 from garps_core.errors import InitialisationError
-from garps_core.features import Matches
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse
-from garps_core.match_depth import (
+from garps_core.start.features import Matches
+from garps_core.start.ransac import pose_from_bearings, ransac
+from garps_core.start.reprojection import (
     MIN_PIXEL_SIGMA,
     Normal,
     OneWay,
