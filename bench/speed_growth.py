@@ -15,8 +15,8 @@ from bench.speed_fresh import STEPS, all_used
 from bench.speed_parts import Check, Inputs, Row, Section, lifted, threads
 from garps_core import Mixture, align_mixtures
 from garps_core.config import Rung
-from garps_core.objective import evaluate
-from garps_core.pairing import pair_up, to_cloud
+from garps_core.objective.pairs import pair_up, to_cloud
+from garps_core.objective.shape import evaluate
 
 Found = TypeVar("Found")
 COMPONENTS = (1000, 3000, 10_000, 30_000, 100_000)

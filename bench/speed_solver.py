@@ -17,9 +17,9 @@ from bench.speed_parts import Check, Inputs, Row, Section, interleaved, medians,
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics, paper, solve
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
-from garps_core.objective import Pairs, evaluate, unpack
-from garps_core.pairing import to_cloud
-from garps_core.state import State
+from garps_core.objective.pairs import to_cloud
+from garps_core.objective.shape import Pairs, evaluate, unpack
+from garps_core.objective.state import State
 
 PAPER_BAR, AUTOGRAD_BAR = 40.0, 200.0
 PLAIN_STEPS = 5

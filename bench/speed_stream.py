@@ -14,8 +14,8 @@ from bench.speed_parts import Check, Inputs, Row, Section, imported_numba, inter
 from garps_core import Config, Mixture
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
-from garps_core.objective import Pairs, evaluate
-from garps_core.pairing import pair_up, thin, to_cloud
+from garps_core.objective.pairs import pair_up, thin, to_cloud
+from garps_core.objective.shape import Pairs, evaluate
 
 SIZES = ((8000, 12), (2000, 20))
 BAR = 4.0

@@ -18,12 +18,12 @@ from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_depth
-from garps_core.pairing import Cloud, overlap, to_cloud
-from garps_core.photometric import sharpen
+from garps_core.objective.brightness import sharpen
+from garps_core.objective.pairs import Cloud, overlap, to_cloud
+from garps_core.objective.state import Belief
 from garps_core.search import search
 from garps_core.solve import MIN_ROWS, Solution
 from garps_core.start.initialise import identity, initialise
-from garps_core.state import Belief
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.uncertainty import inflated, pose_covariance, share_of_known
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from garps_core.geometry import Array
 from garps_core.mixture import Frustum
-from garps_core.photometric import Grid, both_ways, climb_on, grid_of
-from garps_core.state import Belief
+from garps_core.objective.brightness import Grid, both_ways, climb_on, grid_of
+from garps_core.objective.state import Belief
 
 WIDTH_PX = 40
 """Of the small pictures: a basin of some degrees, and still enough points."""

@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from garps_core.config import Alignment
 from garps_core.geometry import Array, skew
-from garps_core.objective import Pairs, evaluate
-from garps_core.pairing import Cloud, pair_up, without_floor
+from garps_core.objective.pairs import Cloud, pair_up, without_floor
+from garps_core.objective.shape import Pairs, evaluate
+from garps_core.objective.state import Belief, State
 from garps_core.solve import MIN_ROWS, Solution, posterior
-from garps_core.state import Belief, State
 
 
 def salient(cloud: Cloud, settings: Alignment) -> Cloud:

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from garps_core.config import Alignment
 from garps_core.geometry import Array, se3_inverse, se3_log
 from garps_core.glance import glances
-from garps_core.pairing import Cloud, overlap
+from garps_core.objective.pairs import Cloud, overlap
+from garps_core.objective.state import Belief, State
 from garps_core.solve import Solution, descend, seen_closely
-from garps_core.state import Belief, State
 
 RINGS = ((1.5, 6, 0.0), (3.0, 8, 0.5))
 """Where the objective's descents begin (`beginnings`)."""

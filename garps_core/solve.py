@@ -17,10 +17,10 @@ import numpy as np
 
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import Array, displacement, se3_inverse, se3_log, skew
-from garps_core.joint import corrected, evaluate_at, two_sided
-from garps_core.objective import Evaluation, Pairs, unpack
-from garps_core.pairing import Cloud, pair_up, thin, visible
-from garps_core.state import Belief, State
+from garps_core.objective.pairs import Cloud, pair_up, thin, visible
+from garps_core.objective.shape import Evaluation, Pairs, unpack
+from garps_core.objective.state import Belief, State
+from garps_core.objective.with_depth_errors import corrected, evaluate_at, two_sided
 
 _SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
 """Compiled loops release the interpreter: target to source is computed beside source to target."""

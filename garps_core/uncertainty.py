@@ -12,10 +12,10 @@ import numpy as np
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import DEPTH_MODES, shared_errors, shared_sigmas
 from garps_core.geometry import Array, point_jacobian, ros_from_twist, se3_inverse
-from garps_core.joint import backward_jacobian
-from garps_core.objective import Pairs, row_information
+from garps_core.objective.shape import Pairs, row_information
+from garps_core.objective.state import Belief, State
+from garps_core.objective.with_depth_errors import backward_jacobian
 from garps_core.solve import Solution, curvature
-from garps_core.state import Belief, State
 
 OPEN_BELOW = 0.02
 """A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""

@@ -10,7 +10,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from garps_core import compiled
 from garps_core.align import estimate_relative_pose
 from garps_core.config import DEPTH_NETWORKS, Config, Reconstruction
 from garps_core.config.combinations import check_settings, check_start
@@ -18,6 +17,7 @@ from garps_core.config.lifting import Lifting
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
+from garps_core.objective.shape import compiled
 from garps_core.types import Prior, View
 from garps_ros.tracking import MIN_DEPTH_SHARE
 

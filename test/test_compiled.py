@@ -13,9 +13,10 @@ import torch
 from scipy.spatial import cKDTree
 from surfaces import TRUTH, K, disturbed, off, random_mixture, random_pose, two_mixtures
 
-from garps_core import Config, align_mixtures, compiled, neighbours, objective, pairing
+from garps_core import Config, align_mixtures
 from garps_core.config import Alignment, Rung
-from garps_core.pairing import image_coordinates, pair_up, to_cloud, visible
+from garps_core.objective.pairs import image_coordinates, pair_up, to_cloud, visible
+from garps_core.objective.shape import compiled, neighbours, pairs, shape
 
 needs_numba = pytest.mark.skipif(not compiled.AVAILABLE, reason="numba is not installed")
 CLOSE = 1e-5
@@ -71,9 +72,9 @@ def test_sums_over_partners_are_torch_s(monkeypatch, kind):
     rows, partners, T = clouds(kind)
     pairs = uncompiled_pairs(monkeypatch, rows, partners, T, replace(SETTINGS, max_distance_m=0.3))
     assert torch.isinf(pairs.log_weights).any(), "partners that are none"
-    mu, S = objective.moved_rows(pairs, T)
-    fast, slow = both(monkeypatch, lambda: objective.row_sums(pairs, mu, S).numpy())
-    exact = objective.row_sums(_double(pairs), *objective.moved_rows(_double(pairs), T)).numpy()
+    mu, S = shape.moved_rows(pairs, T)
+    fast, slow = both(monkeypatch, lambda: shape.row_sums(pairs, mu, S).numpy())
+    exact = shape.row_sums(_double(pairs), *shape.moved_rows(_double(pairs), T)).numpy()
     assert fast.tobytes() != slow.tobytes(), "or one was not used"
     for plane in range(16):
         assert_close(fast[plane], slow[plane], plane)
@@ -91,8 +92,8 @@ def _double(pairs):
 def test_evaluations_are_torch_s(monkeypatch, kind, form):
     rows, partners, T = clouds(kind)
     pairs = uncompiled_pairs(monkeypatch, rows, partners, T)
-    pairs = pairing.without_floor(pairs) if form == "sum" else pairs
-    fast, slow = both(monkeypatch, lambda: objective.evaluate(pairs, T, form))
+    pairs = pairs.without_floor(pairs) if form == "sum" else pairs
+    fast, slow = both(monkeypatch, lambda: shape.evaluate(pairs, T, form))
     assert fast.value == pytest.approx(slow.value, rel=CLOSE) and fast.support == pytest.approx(slow.support, rel=CLOSE)
     for name in ("information", "observed"):
         assert_close(getattr(fast, name), getattr(slow, name), name)
@@ -106,14 +107,14 @@ def test_moments_are_torch_s(monkeypatch, kind):
     """From the same sums, so that nothing but the summation differs."""
     rows, partners, T = clouds(kind)
     pairs = uncompiled_pairs(monkeypatch, rows, partners, T)
-    mu, S = objective.moved_rows(pairs, T)
+    mu, S = shape.moved_rows(pairs, T)
     with monkeypatch.context() as patch:
         patch.setattr(compiled, "AVAILABLE", False)
-        sums = objective.row_sums(pairs, mu, S)
+        sums = shape.row_sums(pairs, mu, S)
     weights = pairs.weights.double()
     c, missing = weights / (1 + sums[0].double()), 1 / weights
     fast = compiled.moments(*(part.numpy() for part in (c, missing, sums, mu, S)))
-    for got, expected in zip(fast, objective._moments(c, missing, sums, mu, S), strict=True):
+    for got, expected in zip(fast, shape._moments(c, missing, sums, mu, S), strict=True):
         assert_close(got, expected)
 
 
@@ -122,7 +123,7 @@ def test_moments_are_torch_s(monkeypatch, kind):
 def test_gathered_partners_are_torch_s(monkeypatch, kind):
     rows, partners, _ = clouds(kind)
     index = torch.from_numpy(np.random.default_rng(0).integers(0, len(partners), (len(rows), 7)))
-    fast, slow = both(monkeypatch, lambda: pairing._gathered(rows, partners, index, RUNG, SETTINGS))
+    fast, slow = both(monkeypatch, lambda: pairs._gathered(rows, partners, index, RUNG, SETTINGS))
     for got, expected, name in zip(fast, slow, ("means", "covariances", "log weights"), strict=True):
         assert got.shape == expected.shape and got.dtype == expected.dtype
         np.testing.assert_allclose(got.numpy(), expected.numpy(), rtol=CLOSE, atol=1e-6, err_msg=name)
@@ -187,7 +188,7 @@ def test_partners_behind_their_camera_are_left_to_the_tree():
     """Cells of an image cannot hold them; the answer is right all the same."""
     rows, partners, T = clouds("scattered")
     behind = replace(partners, means=partners.means - torch.tensor([0, 0, 3.0]))
-    _, distance = pairing._nearest(rows, behind, T, 5, 1.0)
+    _, distance = pairs._nearest(rows, behind, T, 5, 1.0)
     moved = rows.means.double().numpy() @ T[:3, :3].T + T[:3, 3]
     expected, _ = cKDTree(behind.means.double().numpy()).query(moved, k=5)
     np.testing.assert_allclose(distance.numpy(), expected, rtol=CLOSE, atol=1e-6)
@@ -226,7 +227,8 @@ import sys
 sys.modules["numba"] = None
 from surfaces import disturbed, two_mixtures
 from test_compiled import HALF
-from garps_core import Config, align_mixtures, compiled
+from garps_core import Config, align_mixtures
+from garps_core.objective.shape import compiled
 assert not compiled.AVAILABLE and compiled.exponential(0.0) == 1.0
 for preset in ("default", "monocular"):
     config = Config.preset(preset)

@@ -16,12 +16,12 @@ from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, shared_errors
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
-from garps_core.joint import MODES, backward_jacobian, corrected, evaluate_at, evaluate_jointly
 from garps_core.mixtures import reconstruct
-from garps_core.objective import evaluate, row_information
-from garps_core.pairing import pair_up, to_cloud
+from garps_core.objective.pairs import pair_up, to_cloud
+from garps_core.objective.shape import evaluate, row_information
+from garps_core.objective.state import State
+from garps_core.objective.with_depth_errors import MODES, backward_jacobian, corrected, evaluate_at, evaluate_jointly
 from garps_core.solve import two_way
-from garps_core.state import State
 
 DOUBLE = Config(dtype="float64")
 MONOCULAR = Config.preset("monocular")

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import moved, permuted, random_mixture, random_pose
 
-from garps_core import Config, objective
+from garps_core import Config
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import adjoint, se3_exp, se3_inverse
-from garps_core.objective import evaluate
-from garps_core.pairing import pair_up, to_cloud, without_floor
+from garps_core.objective.pairs import pair_up, to_cloud, without_floor
+from garps_core.objective.shape import evaluate, shape
+from garps_core.objective.state import State
 from garps_core.solve import two_way
-from garps_core.state import State
 
 DOUBLE = Config(dtype="float64")
 SETTINGS = Alignment(colour_variance=0.3, semantic_discount=0.7, outlier_floor=0.05, max_distance_m=2.0)
@@ -233,7 +233,7 @@ def assert_same(a, b, tolerance):
 def test_size_of_the_chunks_does_not_matter(form, chunk, monkeypatch):
     pairs = all_pairs(k=9, form=form)
     plain = evaluate(pairs, POSE, form)
-    monkeypatch.setattr(objective, "CHUNK_PAIRS", chunk)
+    monkeypatch.setattr(shape, "CHUNK_PAIRS", chunk)
     assert_same(evaluate(pairs, POSE, form), plain, 1e-10)
 
 

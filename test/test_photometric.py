@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from surfaces import TRUTH, K, flat, grey_at, look, off, room
 
-from garps_core import Config, photometric
+from garps_core import Config
 from garps_core.depth_errors import shared_sigmas
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import brightness_of
-from garps_core.photometric import sharpen
+from garps_core.objective.brightness import sharpen
+from garps_core.objective.shape import brightness
 
 SCENE = {"camera": np.diag([2, 2, 1]) @ K, "size": (240, 320)}
 NEAR = np.diag([0.03**2] * 3 + [np.radians(0.6) ** 2] * 3)
@@ -109,16 +110,16 @@ def off_in_patches(view, seed, size=12, share=0.1):
 
 def test_depth_off_from_place_to_place_makes_less_of_brightness_along_epipolar_lines_only(views):
     """Said of good depth: nothing changes but the weights. Across the lines depth has no say."""
-    x, y = (photometric.grid_of(view, 1) for view in views)
+    x, y = (brightness.grid_of(view, 1) for view in views)
     x_told = replace(x, patch_sigma=0.2)
     away = TRUTH.copy()
     away[:3, 3] = [0.4, 0.0, 0.0]  # epipolar lines along x
-    plain, careful = photometric._compared(x, y, away), photometric._compared(x_told, y, away)
+    plain, careful = brightness._compared(x, y, away), brightness._compared(x_told, y, away)
     ratio = np.diag(careful.information) / np.diag(plain.information)
     assert ratio[0] < 0.75 * ratio[1] and (ratio < 1).all()
     still = np.eye(4)  # without parallax depth does not matter at all
     still[:3, :3] = TRUTH[:3, :3]
-    plain, careful = photometric._compared(x, y, still), photometric._compared(x_told, y, still)
+    plain, careful = brightness._compared(x, y, still), brightness._compared(x_told, y, still)
     np.testing.assert_array_equal(careful.information, plain.information)
 
 
@@ -239,27 +240,27 @@ def test_a_ramp_of_brightness_says_nothing_about_the_shift_along_it():
 @pytest.mark.parametrize("twist", STARTS, ids="+-")
 def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     """At fixed weights and fixed points, with the best exposure; slopes are smoothed, so not to the last digit."""
-    x, y = (photometric.grid_of(view, 1) for view in views)
+    x, y = (brightness.grid_of(view, 1) for view in views)
     T = se3_exp(0.5 * twist) @ TRUTH
 
     def pixels(pose):
-        return photometric._seen_at(x.points @ pose[:3, :3].T + pose[:3, 3], y)
+        return brightness._seen_at(x.points @ pose[:3, :3].T + pose[:3, 3], y)
 
     reach = [T, *(se3_exp(sign * 4e-3 * e) @ T for e in np.eye(6) for sign in (1, -1))]
     kept = np.isfinite([pixels(pose)[:, 0] for pose in reach]).all(axis=0)
     x = replace(x, points=x.points[kept], brightness=x.brightness[kept])
     exposure = np.stack([x.brightness, np.ones(kept.sum())], axis=1)
-    _, weights = photometric._robust(photometric._sampled(y.image, *pixels(T).T), exposure, np.zeros(kept.sum()))
+    _, weights = brightness._robust(brightness._sampled(y.image, *pixels(T).T), exposure, np.zeros(kept.sum()))
 
     def cost(pose):
-        theirs = photometric._sampled(y.image, *pixels(pose).T)
+        theirs = brightness._sampled(y.image, *pixels(pose).T)
         root = np.sqrt(weights)
         fit = np.linalg.lstsq(exposure * root[:, None], theirs * root, rcond=None)[0]
         return 0.5 * weights @ np.square(theirs - exposure @ fit)
 
     size = 2e-3
     numeric = [(cost(se3_exp(size * e) @ T) - cost(se3_exp(-size * e) @ T)) / (2 * size) for e in np.eye(6)]
-    got = photometric._compared(x, y, T)
+    got = brightness._compared(x, y, T)
     scale = np.sqrt(np.diag(got.information))
     error = np.linalg.norm((-got.gradient - numeric) / scale) / np.linalg.norm(numeric / scale)
     assert error < 0.05, "and downhill is where the gradient of the normal equations points"

@@ -14,7 +14,7 @@ from garps_core.depth_errors import depth_sigma
 from garps_core.geometry import pixel_rays, project
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import FRUSTUM_STEP_PX
-from garps_core.pairing import to_cloud, visible
+from garps_core.objective.pairs import to_cloud, visible
 
 UNSMOOTHED = Config().replace({"lifting.smoothing_px": 0})
 VIEW = look()

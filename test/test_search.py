@@ -11,9 +11,9 @@ from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixture
 from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose, search, solve
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.mixtures import reconstruct
-from garps_core.pairing import to_cloud
+from garps_core.objective.pairs import to_cloud
+from garps_core.objective.state import Belief
 from garps_core.start.initialise import identity
-from garps_core.state import Belief
 
 FROM_IDENTITY = Config().replace({"start.method": "identity"})
 LADDER_ONLY = FROM_IDENTITY.replace({"alignment.guess_uncertainty": 1e6})

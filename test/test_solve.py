@@ -13,8 +13,8 @@ from surfaces import DISTURBANCE, FREE, TRUTH, disturbed, flat, grey_at, moved, 
 from garps_core import Config, Prior, Status, align_mixtures, solve
 from garps_core.config import Rung
 from garps_core.geometry import adjoint, inverted, ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
-from garps_core.pairing import overlap, to_cloud, visible
-from garps_core.state import Belief, State
+from garps_core.objective.pairs import overlap, to_cloud, visible
+from garps_core.objective.state import Belief, State
 
 DOUBLE = Config(dtype="float64")
 EXACT = DOUBLE.replace({"alignment.tolerance": 1e-7})

@@ -10,8 +10,8 @@ from surfaces import TRUTH, disturbed, look, off, room
 from garps_core import Config, Mixture, Prior, Status, estimate_relative_pose
 from garps_core.config import Alignment
 from garps_core.geometry import ros_from_twist, se3_exp
-from garps_core.objective import Evaluation
-from garps_core.photometric import Sharpened
+from garps_core.objective.brightness import Sharpened
+from garps_core.objective.shape import Evaluation
 from garps_core.solve import Solution, State
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 

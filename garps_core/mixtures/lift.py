@@ -6,7 +6,7 @@
     weight      = surface area the pixel stands for, so that near and flat-on surfaces are not counted more often
 
 The same code serves a depth sensor and a depth network: only the noise model in `Lifting` differs. What a whole depth
-map gets wrong is not in the components; the alignment knows of it (`depth_errors.py`, `joint.py`).
+map gets wrong is not in the components; the alignment knows of it (`depth_errors.py`, `with_depth_errors.py`).
 """
 
 from __future__ import annotations

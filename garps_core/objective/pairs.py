@@ -10,11 +10,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from garps_core import neighbours
 from garps_core.config import Alignment, Config, Rung
 from garps_core.devices import checked_device
 from garps_core.geometry import Array, se3_inverse
-from garps_core.objective import Pairs, on_compiled_path, pack
+from garps_core.objective.shape import Pairs, neighbours, on_compiled_path, pack
 from garps_core.types import Frustum, Mixture
 
 NEAREST_Z_M = 1e-3

@@ -3,7 +3,7 @@
 
 Neighbours are found with the partners sorted into cells of the image they came from:
 faster than a k-d tree because a surface seen by a camera is nearly flat in the image: the neighbours of a point lie in
-the cells around its pixel. `pairing.py` falls back on SciPy's tree.
+the cells around its pixel. `pairs.py` falls back on SciPy's tree.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.compiled import Float32, Int64, loop
+from garps_core.objective.compiled import Float32, Int64, loop
 
 PER_CELL = 2.0
 """Partners in a cell, on average."""

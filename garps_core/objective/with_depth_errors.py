@@ -22,9 +22,9 @@ from torch import Tensor
 
 from garps_core.depth_errors import DEPTH_MODES, depth_modes
 from garps_core.geometry import Array, adjoint, se3_inverse
-from garps_core.objective import Evaluation, Pairs, combine, evaluate, moved_rows, row_sums, unpack
-from garps_core.pairing import Cloud
-from garps_core.state import State
+from garps_core.objective.pairs import Cloud
+from garps_core.objective.shape import Evaluation, Pairs, combine, evaluate, moved_rows, row_sums, unpack
+from garps_core.objective.state import State
 
 MODES = DEPTH_MODES
 

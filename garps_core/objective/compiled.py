@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same arithmetic as `objective.py` and `pairing.py` in compiled loops, used on a CPU when numba is installed.
+"""The same arithmetic as `shape.py` and `pairs.py` in compiled loops, used on a CPU when numba is installed.
 
 Nothing here decides anything: every function has a torch or SciPy counterpart beside its caller, which gives the same
 numbers to 1e-5 (`test/test_compiled.py`). Loops release the interpreter, so that both directions run at once. One flat
