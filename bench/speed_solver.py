@@ -14,12 +14,13 @@ from torch import Tensor
 
 from bench.autograd import PlainObjective
 from bench.speed_parts import Check, Inputs, Row, Section, interleaved, medians, threads
-from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics, paper, solve
+from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
 from garps_core.objective.pairs import to_cloud
 from garps_core.objective.shape import Pairs, evaluate, unpack
 from garps_core.objective.state import State
+from garps_core.solver import ladder, paper
 
 PAPER_BAR, AUTOGRAD_BAR = 40.0, 200.0
 PLAIN_STEPS = 5
@@ -56,12 +57,12 @@ class Contest:
     def same_problem(self) -> Float64Array:
         """End pose of the default solver's steps on what the paper's solver works on: its objective, its pairs."""
         pairs, start = self.paper_pairs(), State(self.prior.T_target_source)
-        known = solve.Belief(start.T, 1e-9 * np.eye(6))
+        known = ladder.Belief(start.T, 1e-9 * np.eye(6))
 
-        def function(at: State) -> solve.Posterior:
-            return solve.posterior(evaluate(pairs, at.T, "sum"), at, known, 1.0)
+        def function(at: State) -> ladder.Posterior:
+            return ladder.posterior(evaluate(pairs, at.T, "sum"), at, known, 1.0)
 
-        return solve.climb(function, start, SAME_STEPS, 1e-3).at.T
+        return ladder.climb(function, start, SAME_STEPS, 1e-3).at.T
 
     def published(self) -> Float64Array:
         """End pose of the paper's steps on the same, pairs chosen anew as above."""
@@ -73,7 +74,7 @@ class Contest:
         """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
         config = self.configs[DEFAULT]
         source, target = (to_cloud(mixture, config) for mixture in self.mixtures[DEFAULT])
-        pairs = solve.rung_pairs(source, target, T, rung, config.alignment, config.alignment.partner_density)
+        pairs = ladder.rung_pairs(source, target, T, rung, config.alignment, config.alignment.partner_density)
         if pairs is None:
             raise RuntimeError("fewer than 50 components are seen by both views: give another pair")
         return pairs
@@ -125,7 +126,7 @@ def objectives(held: Contest, ends: dict[str, PoseEstimate]) -> dict[str, tuple[
     one_way = held.paper_pairs()
     both_ways = held.rung_pairs(held.configs[DEFAULT].alignment.ladder[-1], pose_of(ends[DEFAULT]))
     return {
-        name: (evaluate(one_way, pose_of(end), "sum").value, solve.two_way(*both_ways, State(pose_of(end))).value)
+        name: (evaluate(one_way, pose_of(end), "sum").value, ladder.two_way(*both_ways, State(pose_of(end))).value)
         for name, end in ends.items()
     }
 

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from garps_core import paper, solve
 from garps_core.config import Alignment, Config
 from garps_core.depth_errors import DEPTH_MODES, shared_sigmas
 from garps_core.devices import checked_device
@@ -21,8 +20,9 @@ from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_dept
 from garps_core.objective.brightness import sharpen
 from garps_core.objective.pairs import Cloud, overlap, to_cloud
 from garps_core.objective.state import Belief
-from garps_core.search import search
-from garps_core.solve import MIN_ROWS, Solution
+from garps_core.solver import ladder, paper
+from garps_core.solver.ladder import MIN_ROWS, Solution
+from garps_core.solver.search import search
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.uncertainty import inflated, pose_covariance, share_of_known
@@ -183,7 +183,7 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     settings = config.alignment
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
-    maximise = paper.maximise if settings.solver == "adam" else search if guess else solve.anneal
+    maximise = paper.maximise if settings.solver == "adam" else search if guess else ladder.anneal
     findings = []
     for solution in maximise(x, y, known, settings):
         findings.append(_finding(solution, x, y, known, guess, config))

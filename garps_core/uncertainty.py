@@ -15,7 +15,7 @@ from garps_core.geometry import Array, point_jacobian, ros_from_twist, se3_inver
 from garps_core.objective.shape import Pairs, row_information
 from garps_core.objective.state import Belief, State
 from garps_core.objective.with_depth_errors import backward_jacobian
-from garps_core.solve import Solution, curvature
+from garps_core.solver.ladder import Solution, curvature
 
 OPEN_BELOW = 0.02
 """A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""

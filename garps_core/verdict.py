@@ -11,7 +11,7 @@ from garps_core.checks import Float64Array
 from garps_core.config import Alignment
 from garps_core.geometry import displacement, se3_inverse, se3_log, twist_from_ros
 from garps_core.objective.brightness import Sharpened
-from garps_core.solve import Solution
+from garps_core.solver.ladder import Solution
 from garps_core.types import Mixture, Prior, Status
 
 RIGHT_M, RIGHT_RAD = 0.05, float(np.radians(2.0))

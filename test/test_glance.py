@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from surfaces import off, room
 
-from garps_core import Config, align, search
-from garps_core.glance import PURSUED, glances
+from garps_core import Config, align
 from garps_core.mixtures import reconstruct
+from garps_core.solver import search
+from garps_core.solver.brightness_search import PURSUED, glances
 from garps_core.start.initialise import identity
 
 KNOWN = align._known(identity(Config(), ""), Config())

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
-from garps_core import Config, Prior, Status, align_mixtures, solve
+from garps_core import Config, Prior, Status, align_mixtures
 from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, shared_errors
@@ -21,7 +21,8 @@ from garps_core.objective.pairs import pair_up, to_cloud
 from garps_core.objective.shape import evaluate, row_information
 from garps_core.objective.state import State
 from garps_core.objective.with_depth_errors import MODES, backward_jacobian, corrected, evaluate_at, evaluate_jointly
-from garps_core.solve import two_way
+from garps_core.solver import ladder
+from garps_core.solver.ladder import two_way
 
 DOUBLE = Config(dtype="float64")
 MONOCULAR = Config.preset("monocular")
@@ -170,7 +171,7 @@ def wrong_in_scale(gains=(1.03, 0.99), shapes=(0.0, 0.0)):
 
 def solved(mixtures, config, prior):
     x, y = (to_cloud(mixture, config) for mixture in mixtures)
-    (solution,) = solve.anneal(x, y, _known(prior, config), config.alignment)
+    (solution,) = ladder.anneal(x, y, _known(prior, config), config.alignment)
     return solution
 
 

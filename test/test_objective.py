@@ -19,7 +19,7 @@ from garps_core.geometry import adjoint, se3_exp, se3_inverse
 from garps_core.objective.pairs import pair_up, to_cloud, without_floor
 from garps_core.objective.shape import evaluate, shape
 from garps_core.objective.state import State
-from garps_core.solve import two_way
+from garps_core.solver.ladder import two_way
 
 DOUBLE = Config(dtype="float64")
 SETTINGS = Alignment(colour_variance=0.3, semantic_discount=0.7, outlier_floor=0.05, max_distance_m=2.0)

@@ -13,9 +13,10 @@ import torch
 from surfaces import FREE, random_pose
 
 from bench.autograd import PlainObjective, rotation
-from garps_core import Config, Mixture, Prior, Status, align_mixtures, paper
+from garps_core import Config, Mixture, Prior, Status, align_mixtures
 from garps_core.geometry import se3_inverse, transform
 from garps_core.objective.pairs import to_cloud
+from garps_core.solver import paper
 
 STEPS = 25
 PAPER = Config.preset("paper").replace({"dtype": "float64"})

@@ -8,11 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose, search, solve
+from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.mixtures import reconstruct
 from garps_core.objective.pairs import to_cloud
 from garps_core.objective.state import Belief
+from garps_core.solver import ladder, search
 from garps_core.start.initialise import identity
 
 FROM_IDENTITY = Config().replace({"start.method": "identity"})
@@ -86,7 +87,7 @@ def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeyp
     assert min(off(solution.T, truth)[0] for solution in found) < 0.005
     for solution in found:
         assert min(len(pairs.means) for pairs in solution.pairs) > 0
-        assert solution.pairs[0].log_weights.shape[0] == solve.FINAL_NEIGHBOURS
+        assert solution.pairs[0].log_weights.shape[0] == ladder.FINAL_NEIGHBOURS
     (one,) = search.search(x, y, known, replace(settings, search_followed=1))
     assert one.T.tobytes() == found[0].T.tobytes()
 
@@ -110,7 +111,7 @@ def test_a_convincing_solution_ends_the_search(monkeypatch):
 
 
 def test_poses_that_lie_together_are_one():
-    states = [solve.State(T) for T in (random_pose(1), random_pose(2), random_pose(1, 0.3001), random_pose(2))]
+    states = [ladder.State(T) for T in (random_pose(1), random_pose(2), random_pose(1, 0.3001), random_pose(2))]
     assert list(search._distinct(states)) == states[:2]
     assert np.linalg.norm(se3_log(states[0].T @ se3_inverse(states[1].T))) > search.SAME_RAD
 

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from surfaces import DISTURBANCE, FREE, TRUTH, disturbed, flat, grey_at, moved, off, permuted, random_pose, two_mixtures
 
-from garps_core import Config, Prior, Status, align_mixtures, solve
+from garps_core import Config, Prior, Status, align_mixtures
 from garps_core.config import Rung
 from garps_core.geometry import adjoint, inverted, ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
 from garps_core.objective.pairs import overlap, to_cloud, visible
 from garps_core.objective.state import Belief, State
+from garps_core.solver import ladder
 
 DOUBLE = Config(dtype="float64")
 EXACT = DOUBLE.replace({"alignment.tolerance": 1e-7})
@@ -39,7 +40,7 @@ def rung(views):
     """Both directions' pairs of the last rung at the disturbed start, and the start's twist covariance."""
     x, y = (to_cloud(mixture, DOUBLE) for mixture in views)
     start = disturbed(twist=0.2 * DISTURBANCE).T_target_source
-    return *solve.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment, density=1.0), start
+    return *ladder.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment, density=1.0), start
 
 
 def test_the_start_is_as_far_off_as_it_claims():
@@ -186,10 +187,12 @@ def test_a_climb_never_goes_downhill(rung, seed):
     seen = []
 
     def function(at):
-        seen.append(solve.posterior(solve.two_way(forward, backward, at), at, Belief(start, np.linalg.inv(FREE)), 60.0))
+        seen.append(
+            ladder.posterior(ladder.two_way(forward, backward, at), at, Belief(start, np.linalg.inv(FREE)), 60.0)
+        )
         return seen[-1]
 
-    end = solve.climb(function, State(start), 8, 1e-3)
+    end = ladder.climb(function, State(start), 8, 1e-3)
     values = [there.value for there in seen]
     assert end.posterior.value == max(values) >= values[0]
     assert len(seen) == end.iterations + 1 and (end.converged or end.iterations == 8)
@@ -200,9 +203,9 @@ def test_a_climb_keeps_what_it_has_where_every_step_fails():
 
     def function(at):
         r = se3_log(at.T)
-        return solve.Posterior(-float(r @ r), np.ones(6), np.eye(6), None)
+        return ladder.Posterior(-float(r @ r), np.ones(6), np.eye(6), None)
 
-    end = solve.climb(function, State(np.eye(4)), 12, 1e-6)
+    end = ladder.climb(function, State(np.eye(4)), 12, 1e-6)
     np.testing.assert_array_equal(end.at.T, np.eye(4))
     assert 2 < end.iterations <= 12
 
@@ -218,7 +221,7 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 
     def at(twist):
         there = State(se3_exp(np.asarray(twist)) @ T)
-        return solve.posterior(solve.two_way(forward, backward, there), there, Belief(T_prior, precision), 60.0)
+        return ladder.posterior(ladder.two_way(forward, backward, there), there, Belief(T_prior, precision), 60.0)
 
     numeric = [(at(1e-5 * e).value - at(-1e-5 * e).value) / 2e-5 for e in np.eye(6)]
     gradient = at(np.zeros(6)).gradient
@@ -227,10 +230,10 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 
 def test_information_of_the_posterior_is_the_data_s_plus_the_prior_s(rung):
     forward, backward, T = rung
-    data = solve.two_way(forward, backward, State(T))
-    alone = solve.posterior(data, State(T), Belief(T, np.zeros((6, 6))), 60.0)
-    both = solve.posterior(data, State(T), Belief(T, np.linalg.inv(FREE)), 60.0)
-    np.testing.assert_allclose(alone.information, 60 * solve.curvature(data))
+    data = ladder.two_way(forward, backward, State(T))
+    alone = ladder.posterior(data, State(T), Belief(T, np.zeros((6, 6))), 60.0)
+    both = ladder.posterior(data, State(T), Belief(T, np.linalg.inv(FREE)), 60.0)
+    np.testing.assert_allclose(alone.information, 60 * ladder.curvature(data))
     np.testing.assert_allclose(both.information - alone.information, np.linalg.inv(FREE), atol=1e-6)
 
 
@@ -239,19 +242,19 @@ def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(seed):
     twist = np.random.default_rng(seed).normal(size=6) * 0.4
     T = se3_exp(twist)
     numeric = [(se3_log(se3_exp(1e-6 * e) @ T) - se3_log(se3_exp(-1e-6 * e) @ T)) / 2e-6 for e in np.eye(6)]
-    np.testing.assert_allclose(solve.inverse_left_jacobian(twist), np.transpose(numeric), atol=2e-5)
-    assert np.abs(solve.inverse_left_jacobian(twist) - np.eye(6)).max() > 1e-3, "or the identity would do"
+    np.testing.assert_allclose(ladder.inverse_left_jacobian(twist), np.transpose(numeric), atol=2e-5)
+    assert np.abs(ladder.inverse_left_jacobian(twist) - np.eye(6)).max() > 1e-3, "or the identity would do"
 
 
 def test_curvature_lies_between_its_bounds(rung):
     """And is the observed information itself where that is within them."""
     forward, backward, T = rung
-    data = solve.two_way(forward, backward, State(T))
+    data = ladder.two_way(forward, backward, State(T))
     L = np.linalg.inv(np.linalg.cholesky(data.information))
-    shares = np.linalg.eigvalsh(L @ solve.curvature(data) @ L.T)
+    shares = np.linalg.eigvalsh(L @ ladder.curvature(data) @ L.T)
     observed = np.linalg.eigvalsh(L @ data.observed @ L.T)
-    np.testing.assert_allclose(shares, np.clip(observed, solve.SMALLEST_CURVATURE, 1), atol=1e-6)
-    raised = np.linalg.eigvalsh(L @ solve.curvature(data, 0.9) @ L.T)
+    np.testing.assert_allclose(shares, np.clip(observed, ladder.SMALLEST_CURVATURE, 1), atol=1e-6)
+    raised = np.linalg.eigvalsh(L @ ladder.curvature(data, 0.9) @ L.T)
     np.testing.assert_allclose(raised, np.clip(observed, 0.9, 1), atol=1e-6)
     assert observed[0] < 0.9
 
@@ -262,16 +265,16 @@ def test_displacement_is_that_of_points_moved_at_random():
     rng = np.random.default_rng(1)
     twists = rng.multivariate_normal(np.zeros(6), covariance, size=20_000)
     moves = twists[:, None, :3] + np.cross(twists[:, None, 3:], points[None])
-    for index, expected in enumerate(solve.displacement(points, covariance)):
+    for index, expected in enumerate(ladder.displacement(points, covariance)):
         np.testing.assert_allclose(np.cov(moves[:, index].T), expected, atol=0.05 * expected.max())
 
 
 def test_a_precise_start_skips_the_wide_rungs(views):
     source = to_cloud(views[0], Config())
-    entries = [solve.entry(source, TRUTH, scale * FREE, LADDER) for scale in np.geomspace(1e3, 1e-4, 60)]
+    entries = [ladder.entry(source, TRUTH, scale * FREE, LADDER) for scale in np.geomspace(1e3, 1e-4, 60)]
     assert entries == sorted(entries) and set(entries) == set(range(len(LADDER)))
-    assert solve.entry(source, TRUTH, 1e4 * FREE, LADDER) == 0
-    assert solve.entry(source, TRUTH, FREE, LADDER[:1]) == 0
+    assert ladder.entry(source, TRUTH, 1e4 * FREE, LADDER) == 0
+    assert ladder.entry(source, TRUTH, FREE, LADDER[:1]) == 0
 
 
 def test_the_last_rung_alone_does_not_find_the_way(views):

@@ -19,8 +19,9 @@ from bench.speed_pairs import CHAIN, GARPS, pairs_section
 from bench.speed_parts import Check, Inputs, Section, interleaved, markdown, threads
 from bench.speed_solver import autograd_section, contest, paper_section, plain, start_of
 from bench.speed_stream import _loop, _planes, _torch_stream, exact_pairs, reference, stream_section
-from garps_core import Config, Prior, paper
+from garps_core import Config, Prior
 from garps_core.geometry import se3_inverse
+from garps_core.solver import paper
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from garps_core.config import Alignment
 from garps_core.geometry import ros_from_twist, se3_exp
 from garps_core.objective.brightness import Sharpened
 from garps_core.objective.shape import Evaluation
-from garps_core.solve import Solution, State
+from garps_core.solver.ladder import Solution, State
 from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
 
 SETTINGS = Alignment()

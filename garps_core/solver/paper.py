@@ -19,7 +19,7 @@ from garps_core.geometry import Array, skew
 from garps_core.objective.pairs import Cloud, pair_up, without_floor
 from garps_core.objective.shape import Pairs, evaluate
 from garps_core.objective.state import Belief, State
-from garps_core.solve import MIN_ROWS, Solution, posterior
+from garps_core.solver.ladder import MIN_ROWS, Solution, posterior
 
 
 def salient(cloud: Cloud, settings: Alignment) -> Cloud:

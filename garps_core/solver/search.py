@@ -3,7 +3,7 @@
 
 Kernels of a coarse rung are blurred by decimetres, so that surfaces pull from where a guess leaves them. Even so an
 optimum is only found from some tens of degrees, hence beginnings that are turned about the camera's axes, ranked by the
-objective. Brightness finds its own (`glance.py`), in places with little shape; bare walls are found by shape. The prior
+objective. Brightness finds its own (`brightness_search.py`), in places with little shape; bare walls are found by shape. The prior
 holds all of them together: it is as wide as the guess.
 """
 
@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from garps_core.config import Alignment
 from garps_core.geometry import Array, se3_inverse, se3_log
-from garps_core.glance import glances
 from garps_core.objective.pairs import Cloud, overlap
 from garps_core.objective.state import Belief, State
-from garps_core.solve import Solution, descend, seen_closely
+from garps_core.solver.brightness_search import glances
+from garps_core.solver.ladder import Solution, descend, seen_closely
 
 RINGS = ((1.5, 6, 0.0), (3.0, 8, 0.5))
 """Where the objective's descents begin (`beginnings`)."""
