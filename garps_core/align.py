@@ -25,8 +25,8 @@ from garps_core.solver.ladder import MIN_ROWS, Solution
 from garps_core.solver.search import search
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.uncertainty import inflated, pose_covariance, share_of_known
-from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
+from garps_core.verdict.covariance import inflated, pose_covariance, share_of_known
+from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0
 """What a search found may be a neighbour of the right optimum: its sigmas count so many times as much."""

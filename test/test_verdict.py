@@ -13,7 +13,7 @@ from garps_core.geometry import ros_from_twist, se3_exp
 from garps_core.objective.brightness import Sharpened
 from garps_core.objective.shape import Evaluation
 from garps_core.solver.ladder import Solution, State
-from garps_core.verdict import Finding, quality, relative_uncertainty, verdict
+from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
 
 SETTINGS = Alignment()
 SMALL = np.diag([0.005**2] * 3 + [0.002**2] * 3)
