@@ -8,8 +8,8 @@ fraction of a pixel. Eight modes of one view stand for them, each a field of dis
           relative depth error; the first is the scale
     6, 7  z times the x and y axes: the direction in which the camera believes a pixel to look, in rad
 
-Depth errors may be solved for together with the pose (`with_depth_errors.py`). What one sigma of every mode that is not does to
-the pose is added to the pose's covariance.
+Depth errors may be solved for together with the pose (`with_depth_errors.py`). What one sigma of every mode that is not
+does to the pose is added to the pose's covariance.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from garps_core.config.lifting import Lifting
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
-from garps_core.objective.shape import compiled
+from garps_core.objective import compiled
 from garps_core.types import Prior, View
 from garps_ros.tracking import MIN_DEPTH_SHARE
 

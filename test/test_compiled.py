@@ -16,7 +16,7 @@ from surfaces import TRUTH, K, disturbed, off, random_mixture, random_pose, two_
 from garps_core import Config, align_mixtures
 from garps_core.config import Alignment, Rung
 from garps_core.objective.pairs import image_coordinates, pair_up, to_cloud, visible
-from garps_core.objective.shape import compiled, neighbours, pairs, shape
+from garps_core.objective import compiled, neighbours, pairs, shape
 
 needs_numba = pytest.mark.skipif(not compiled.AVAILABLE, reason="numba is not installed")
 CLOSE = 1e-5
@@ -228,7 +228,7 @@ sys.modules["numba"] = None
 from surfaces import disturbed, two_mixtures
 from test_compiled import HALF
 from garps_core import Config, align_mixtures
-from garps_core.objective.shape import compiled
+from garps_core.objective import compiled
 assert not compiled.AVAILABLE and compiled.exponential(0.0) == 1.0
 for preset in ("default", "monocular"):
     config = Config.preset(preset)

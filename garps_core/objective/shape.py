@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from garps_core.geometry import Array, skew
-from garps_core.objective.shape import compiled
+from garps_core.objective import compiled
 
 CHUNK_PAIRS = 1 << 15
 """Pairs handled at a time: sixteen float32 planes of this size stay in a CPU core's second-level cache."""
