@@ -36,7 +36,7 @@ from bench.demo_rgb import rgb_part
 from bench.rooms import RoomPair, make_pair
 from bench.stereo import StereoPair, depth_of_both, load_pairs
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
-from garps_core.figure import before_after
+from garps_core.cli.figure import before_after
 from garps_core.mixtures import reconstruct
 from garps_ros.replay import main as replay
 

@@ -18,7 +18,7 @@ from bench.depth_errors import depth_errors
 from bench.rooms import RoomPair, make_pair
 from garps_core import View, metrics
 from garps_core.checks import Float64Array
-from garps_core.cli import main as garps
+from garps_core.cli.command import main as garps
 from garps_core.models.demo_net import WHAT_IT_IS, depth_of, shipped
 
 ROOM_SEED, ROOM_LEVEL = 12, 3

@@ -19,7 +19,7 @@ from bench.sources import with_depth_of
 from bench.statistics_blocks import pair_of
 from bench.tables import GARPS, START, Row, print_tables, write
 from garps_core import Config
-from garps_core.figure import before_after
+from garps_core.cli.figure import before_after
 from garps_core.mixtures import reconstruct
 
 MAX_PICTURES = 8

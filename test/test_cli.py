@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from garps_core import cli, doctor
+from garps_core.cli import command, doctor
 from garps_core.geometry import se3_exp, se3_log
 from garps_core.types import PoseEstimate, Prior, Status
 
@@ -60,7 +60,7 @@ def arguments(files: dict[str, str], *more: str, unit: str = "mm") -> list[str]:
 
 @pytest.mark.parametrize("unit", ["mm", "m"])
 def test_json_holds_the_true_pose(files: dict[str, str], capsys: pytest.CaptureFixture[str], unit: str) -> None:
-    code = cli.main(arguments(files, "--json", unit=unit))
+    code = command.main(arguments(files, "--json", unit=unit))
     out = json.loads(capsys.readouterr().out)
     assert code == (0 if out["ok"] else 1)
     T = np.array(out["T_target_source"])
@@ -74,7 +74,7 @@ def test_json_holds_the_true_pose(files: dict[str, str], capsys: pytest.CaptureF
 
 
 def test_the_summary_tells_a_person(files: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    cli.main(arguments(files))
+    command.main(arguments(files))
     out = capsys.readouterr().out
     for word in ("status", "translation", "sigma", "rotation", "quaternion", "start", "overlap", "time"):
         assert word in out
@@ -82,7 +82,7 @@ def test_the_summary_tells_a_person(files: dict[str, str], capsys: pytest.Captur
 
 def test_picture_and_splats_are_written(files: dict[str, str], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    cli.main(arguments(files, "--figure", str(tmp_path / "pair.png"), "--ply", str(tmp_path / "splats")))
+    command.main(arguments(files, "--figure", str(tmp_path / "pair.png"), "--ply", str(tmp_path / "splats")))
     assert (tmp_path / "pair.png").stat().st_size > 10_000
     assert {p.name for p in (tmp_path / "splats").iterdir()} == {"source.ply", "target.ply", "aligned.ply"}
 
@@ -126,7 +126,7 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_is_one_line_and_code_2(files: dict[str, str], capsys: pytest.CaptureFixture[str], name: str) -> None:
     words, expected = MISTAKES[name]
-    assert cli.main(words(files)) == 2
+    assert command.main(words(files)) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("garps: error: ")
@@ -144,7 +144,7 @@ def test_files_that_do_not_fit_are_named(
     empty = tmp_path / "empty.png"
     empty.touch()
     for path, expected in ((small, "60x80"), (broken, "no plain .npy"), (pickled, "no plain .npy"), (empty, "0 bytes")):
-        assert cli.main(arguments(files, "--depth-target", str(path))) == 2
+        assert command.main(arguments(files, "--depth-target", str(path))) == 2
         err = capsys.readouterr().err
         assert str(path) in err
         assert expected in err
@@ -154,13 +154,13 @@ def test_no_pose_is_code_1_with_the_reason(
     files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = PoseEstimate(Status.NO_INITIAL_POSE, "4 matches, 12 are needed")
-    monkeypatch.setattr(cli, "estimate_with_mixtures", lambda *_: (none, None))
-    assert cli.main(arguments(files, "--figure", str(tmp_path / "a.png"))) == 1
+    monkeypatch.setattr(command, "estimate_with_mixtures", lambda *_: (none, None))
+    assert command.main(arguments(files, "--figure", str(tmp_path / "a.png"))) == 1
     captured = capsys.readouterr()
     assert "no_initial_pose: 4 matches" in captured.out
     assert "no picture" in captured.err
     assert not (tmp_path / "a.png").exists()
-    assert cli.main(arguments(files, "--json")) == 1
+    assert command.main(arguments(files, "--json")) == 1
     out = json.loads(capsys.readouterr().out)
     assert out["T_target_source"] is None
     assert out["objective"] is None
@@ -173,9 +173,9 @@ def test_a_prior_is_read_in_ros_quaternion_order(files: dict[str, str], monkeypa
         seen.append(prior)
         return PoseEstimate(Status.NO_INITIAL_POSE, ""), None
 
-    monkeypatch.setattr(cli, "estimate_with_mixtures", keep)
+    monkeypatch.setattr(command, "estimate_with_mixtures", keep)
     quarter = "-1 2 3 0 0 0.70710678 0.70710678"
-    assert cli.main([*without(arguments(files), "--prior"), "--prior", quarter, "--prior-sigma", "0.2 0.1"]) == 1
+    assert command.main([*without(arguments(files), "--prior"), "--prior", quarter, "--prior-sigma", "0.2 0.1"]) == 1
     T = seen[0].T_target_source
     np.testing.assert_allclose(T[:3, :3] @ (1, 0, 0), (0, 1, 0), atol=1e-7)
     np.testing.assert_allclose(T[:3, 3], (-1, 2, 3))
@@ -183,11 +183,11 @@ def test_a_prior_is_read_in_ros_quaternion_order(files: dict[str, str], monkeypa
 
 
 def test_help_version_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--version"]) == 0
+    assert command.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("garps 0.")
-    assert cli.main(["align", "--help"]) == 0
+    assert command.main(["align", "--help"]) == 0
     assert "Example:" in capsys.readouterr().out
-    assert cli.main(["doctor"]) == 0
+    assert command.main(["doctor"]) == 0
     out = capsys.readouterr().out
     for word in ("python", "torch", "rclpy", "devices", "memory", "self-test       ok"):
         assert word in out
@@ -203,7 +203,7 @@ def test_doctor_names_what_networks_need(
         (tmp_path / file).touch()
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "huggingface_hub" else real(name))
-    assert cli.main(["doctor"]) == 0
+    assert command.main(["doctor"]) == 0
     told = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
     assert told["weights"] == f"depth-anything-v2-outdoor-small, dinov2-small-hf, in {tmp_path}"
     assert told["safetensors"] == importlib.metadata.version("safetensors")

@@ -15,8 +15,8 @@ from surfaces import TRUTH, K, disturbed, off, random_mixture, random_pose, two_
 
 from garps_core import Config, align_mixtures
 from garps_core.config import Alignment, Rung
-from garps_core.objective.pairs import image_coordinates, pair_up, to_cloud, visible
 from garps_core.objective import compiled, neighbours, pairs, shape
+from garps_core.objective.pairs import image_coordinates, pair_up, to_cloud, visible
 
 needs_numba = pytest.mark.skipif(not compiled.AVAILABLE, reason="numba is not installed")
 CLOSE = 1e-5

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from garps_core import Config, View, cli, estimate_relative_pose, metrics
+from garps_core import Config, View, estimate_relative_pose, metrics
+from garps_core.cli import command
+from garps_core.cli.doctor import examine
 from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
-from garps_core.doctor import examine
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models import demo_net, in_use
@@ -171,7 +172,7 @@ def test_two_plain_images_give_a_pose_on_the_command_line(
 
     pair = rooms[0]
     words = written(pair, tmp_path)
-    assert cli.main([*words, "--json", "--ply", str(tmp_path)]) == 0
+    assert command.main([*words, "--json", "--ply", str(tmp_path)]) == 0
     found = json.loads(capsys.readouterr().out)
     T = np.array(found["T_target_source"])
     assert DEMONSTRATION in found["depth_from"]
@@ -179,7 +180,7 @@ def test_two_plain_images_give_a_pose_on_the_command_line(
     assert metrics.translation_error_m(T, pair.T_1_0) < 0.15
     assert metrics.nees(T, np.array(found["covariance"]), pair.T_1_0) < 3 * metrics.CHI2_6_95
     asked = [word.replace("--preset", "--reconstruction") for word in words]  # brings its preset with it
-    assert cli.main(asked) == 0
+    assert command.main(asked) == 0
     assert f"depth        by demo_net, {DEMONSTRATION}" in capsys.readouterr().out
     assert (tmp_path / "source.ply").is_file() or list(tmp_path.glob("*.ply"))
 

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
+from garps_core.cli.figure import BLUE, GREEN, YELLOW, before_after
 from garps_core.errors import InputError
-from garps_core.figure import BLUE, GREEN, YELLOW, before_after
 from garps_core.geometry import se3_exp, se3_inverse, transform
 from garps_core.types import Mixture
 

@@ -11,7 +11,8 @@ from network_weights import GOLDEN, install, pair, passes, write_pair
 from test_cli import K_WORDS, START, TRUTH
 from test_mask2former import ADAPTER, HEAD, random_state
 
-from garps_core import Config, Prior, align_mixtures, cli, metrics
+from garps_core import Config, Prior, align_mixtures, metrics
+from garps_core.cli import command
 from garps_core.geometry import se3_exp
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.flash3d import labels_of, predict_gaussians
@@ -53,7 +54,7 @@ def test_two_pictures_by_flash3d(files: dict[str, str], tmp_path: Path, capsys: 
     extras = ["--json", "--figure", str(tmp_path / "pair.png"), "--ply", str(tmp_path / "splats")]
     depth, gaussians = networks()
     with passes(depth) as of_depth, passes(gaussians) as of_gaussians:
-        code = cli.main(["align", files["a"], files["b"], *K_WORDS, "--reconstruction", "flash3d", *extras])
+        code = command.main(["align", files["a"], files["b"], *K_WORDS, "--reconstruction", "flash3d", *extras])
     assert code == 1
     assert of_depth == [(2, 3, 70, 98)]
     assert of_gaussians == [(1, 3, *PADDED)] * 2
@@ -72,7 +73,7 @@ def test_two_pictures_by_the_depth_network_alone(files: dict[str, str], capsys: 
     """Without depth files the preset is monocular, and nothing else has to be said."""
     depth, gaussians = networks()
     with passes(depth) as of_depth, passes(gaussians) as of_gaussians:
-        assert cli.main(["align", files["a"], files["b"], *K_WORDS, "--json"]) in (0, 1)
+        assert command.main(["align", files["a"], files["b"], *K_WORDS, "--json"]) in (0, 1)
     assert (of_depth, of_gaussians) == ([(2, 3, 70, 98)], [])
     out = json.loads(capsys.readouterr().out)
     assert out["quality"] < 0.1, "depth that means nothing"
@@ -83,7 +84,7 @@ def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captur
     """Even with pseudo-random offsets around it, the pose is near the truth then."""
     depths = ["--depth-source", files["a_mm"], "--depth-target", files["b_mm"]]
     with passes(networks()[0]) as of_depth:
-        cli.main(["align", files["a"], files["b"], *K_WORDS, *depths, "--reconstruction", "flash3d", "--json"])
+        command.main(["align", files["a"], files["b"], *K_WORDS, *depths, "--reconstruction", "flash3d", "--json"])
     assert of_depth == []
     T = np.array(json.loads(capsys.readouterr().out)["T_target_source"])
     assert metrics.translation_error_m(T, TRUTH) < 0.05
@@ -104,7 +105,7 @@ def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captur
 )
 def test_mistakes_are_one_line(files: dict[str, str], words: list[str], message: str, capsys: Captured) -> None:
     given = [*words, files["a_mm"]] if words == ["--depth-source"] else words
-    assert cli.main(["align", files["a"], files["b"], *K_WORDS, *given]) == 2
+    assert command.main(["align", files["a"], files["b"], *K_WORDS, *given]) == 2
     captured = capsys.readouterr()
     assert message in captured.err and captured.err.count("\n") == 1 and captured.out == ""
 
@@ -180,14 +181,14 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], np.ndar
 
 
 def test_two_splat_files_give_the_true_pose(splats: tuple[list[str], np.ndarray], capsys: Captured) -> None:
-    from garps_core.report import as_json
+    from garps_core.cli.report import as_json
     from garps_core.types import PoseEstimate, Status
 
     paths, truth = splats
     off = se3_exp(np.array([0.05, -0.04, 0.03, 0.02, -0.03, 0.02])) @ truth
     told = as_json(PoseEstimate(Status.CONVERGED, "", off, np.eye(6)))
     prior = " ".join(map(str, (*told["translation_m"], *told["quaternion_xyzw"])))
-    code = cli.main(["align", *paths, "--prior", prior, "--json"])
+    code = command.main(["align", *paths, "--prior", prior, "--json"])
     out = json.loads(capsys.readouterr().out)
     assert code == 0, out["reason"]
     T = np.array(out["T_target_source"])
@@ -211,14 +212,14 @@ def test_two_splat_files_give_the_true_pose(splats: tuple[list[str], np.ndarray]
 def test_splats_and_pictures_do_not_mix(
     splats: tuple[list[str], np.ndarray], files: dict[str, str], words, message: str, capsys: Captured
 ) -> None:
-    assert cli.main(["align", *words(splats[0], files["a"]), "--prior", START]) == 2
+    assert command.main(["align", *words(splats[0], files["a"]), "--prior", START]) == 2
     assert message in capsys.readouterr().err
 
 
 def test_the_published_pipeline_is_one_command(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
     """Up to its mixtures; with a reduced Mask2Former, since the published one has gigabytes."""
     published = ["--preset", "paper", "--reconstruction", "flash3d", "--set", "reconstruction.semantics=m2f"]
-    assert cli.main(["align", files["a"], files["b"], *K_WORDS, *published]) == 2
+    assert command.main(["align", files["a"], files["b"], *K_WORDS, *published]) == 2
     assert "download it from https://dl.fbaipublicfiles.com/dinov2/dinov2_vitg14/" in capsys.readouterr().err
     torch.save(random_state(Mask2Former(ADAPTER, HEAD)), tmp_path / "m2f.pth")
     changes = {"method": "flash3d", "semantics": "m2f", "semantic_weights": str(tmp_path / "m2f.pth")}

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from network_weights import install
 
-from garps_core import Config, cli, metrics
+from garps_core import Config, metrics
+from garps_core.cli import command
 from garps_core.models import depth_anything
 from garps_ros import replay
 
@@ -71,11 +72,11 @@ def test_the_example_without_depth_asks_for_the_network_it_names(
     (fetch,) = [words for words in commands(README) if words[:3] == ["garps", "weights", "fetch"]]
     (words,) = [words for words in commands(README) if words[:2] == ["garps", "align"] and words[-5] == "--K"]
     monkeypatch.setenv("GARPS_WEIGHTS", str(folder[0]))
-    assert cli.main(words[1:]) == 2
+    assert command.main(words[1:]) == 2
     assert " ".join(fetch) in capsys.readouterr().err
     install(folder[0], fetch[-1])
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 70)
-    assert cli.main(words[1:]) in (0, 1)
+    assert command.main(words[1:]) in (0, 1)
     assert "depth " in capsys.readouterr().out
 
 
@@ -100,7 +101,7 @@ def test_the_command_line_example_works(
 ) -> None:
     monkeypatch.chdir(folder[0])
     (words,) = [words for words in commands(README) if words[:2] == ["garps", "align"] and "--depth-source" in words]
-    assert cli.main(words[1:]) == 0
+    assert command.main(words[1:]) == 0
     assert "converged" in capsys.readouterr().out
     assert (folder[0] / "pair.png").stat().st_size > 10_000
 
@@ -136,8 +137,8 @@ def test_named_commands_exist(path: Path) -> None:
 def test_named_options_exist(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     helps = {}
     for program, main, words in (
-        ("garps", cli.main, ["align", "--help"]),
-        *((f"garps weights {name}", cli.main, ["weights", name, "--help"]) for name in WEIGHTS_COMMANDS),
+        ("garps", command.main, ["align", "--help"]),
+        *((f"garps weights {name}", command.main, ["weights", name, "--help"]) for name in WEIGHTS_COMMANDS),
         ("garps-replay", replay.main, ["--help"]),
     ):
         main(words)

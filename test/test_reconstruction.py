@@ -14,7 +14,8 @@ import torch
 from network_weights import DEPTH, install, pair, passes, tensors
 from test_cli import K
 
-from garps_core import Config, Status, View, cli, estimate_relative_pose
+from garps_core import Config, Status, View, estimate_relative_pose
+from garps_core.cli import command
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.reconstruct import with_depth
@@ -98,13 +99,13 @@ def test_a_pose_comes_with_the_time_of_the_network() -> None:
 
 def test_nothing_installed_says_what_to_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
-    for changes, command in (
+    for changes, wanted in (
         ({}, "garps weights fetch depth-anything-v2-indoor-small"),
         ({"scene": "outdoor"}, "garps weights fetch depth-anything-v2-outdoor-small"),
         ({"depth_weights": "depth-anything-v2-indoor-base"}, "garps weights fetch depth-anything-v2-indoor-base"),
     ):
         for method in ("auto", "depth_anything_v2", "flash3d"):
-            with pytest.raises(WeightsError, match=f"`{command}`"):
+            with pytest.raises(WeightsError, match=f"`{wanted}`"):
                 estimate_relative_pose(*pair(), asked(method=method, **changes))
     with pytest.raises(WeightsError, match=r"no depth with the image.*or give depth"):
         with_depth(pair(), MONOCULAR)
@@ -292,7 +293,7 @@ def test_every_layout_of_a_file_gives_the_same_depth(layout: str, weights: Path,
     if layout == "safetensors":
         path = path.with_suffix(".safetensors")
         source = str(weights / BY_NAME[DEPTH].local)
-        assert cli.main(["weights", "convert", source, str(path), "--variant", "indoor"]) == 0
+        assert command.main(["weights", "convert", source, str(path), "--variant", "indoor"]) == 0
     else:
         wrapped = layout in ("model", "state_dict")
         torch.save({layout: tensors(DEPTH), "epoch": 3} if wrapped else tensors(DEPTH), path)

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from garps_core import Config, ConfigError, cli
+from garps_core import Config, ConfigError
+from garps_core.cli import command
 from garps_core.config import PRESETS
 from garps_core.config.text import MAX_BYTES, read_settings, write_settings
 
@@ -78,7 +79,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 def test_the_command_takes_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, "lifting.strid: 4")
     words = ["align", "a.png", "b.png", "--K", "500", "500", "320", "240", "--settings", str(path)]
-    assert cli.main(words) == 2
+    assert command.main(words) == 2
     assert "did you mean 'lifting.stride'" in capsys.readouterr().err
 
 

@@ -16,7 +16,8 @@ from test_cli import K_WORDS
 from two_view_fixtures import CALLS, FAULTS, RECORDED, installed_here, installed_package, write_maps
 
 from bench.rooms import RoomPair, make_pair
-from garps_core import Config, ConfigError, PoseEstimate, Prior, Status, View, cli, estimate_relative_pose
+from garps_core import Config, ConfigError, PoseEstimate, Prior, Status, View, estimate_relative_pose
+from garps_core.cli import command
 from garps_core.errors import WeightsError
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, twist_from_ros
 from garps_core.point_maps import PairMaps, PointMap
@@ -245,13 +246,13 @@ def test_two_picture_files_are_all_it_takes(
     words = ["align", *written(room, tmp_path), "--preset", "mast3r", *own]
     numbers = [[str(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))] for K in (room.K0, room.K1)]
     given = ["--K", *numbers[0], "--K-target", *numbers[1]] if calibrated else []
-    assert cli.main([*words, *given, "--json"]) == 0
+    assert command.main([*words, *given, "--json"]) == 0
     out = json.loads(capsys.readouterr().out)
     assert out["initial"]["origin"] == RECORDED
     assert np.abs(off(Prior(np.array(out["T_target_source"]), np.eye(6)), room.T_1_0)).max() < 0.05
     told = out["estimated_fx_px"]
     assert told == [None, None] if calibrated else told == pytest.approx([room.K0[0, 0], room.K1[0, 0]], rel=0.05)
-    assert cli.main([*words, *given]) == 0
+    assert command.main([*words, *given]) == 0
     text = capsys.readouterr().out
     assert ("intrinsics   estimated: focal lengths 2" in text) == (not calibrated)
     assert "start        recorded (" in text
@@ -259,7 +260,7 @@ def test_two_picture_files_are_all_it_takes(
 
 def test_one_camera_of_two_cannot_be_unknown(room: RoomPair, maps: Path, tmp_path: Path, capsys: Captured) -> None:
     own = ["--start", "adapter", "--set", f"start.adapter={RECORDED}", "--set", f"start.weights={maps}"]
-    assert cli.main(["align", *written(room, tmp_path), *own, "--K-target", "200", "200", "160", "120"]) == 2
+    assert command.main(["align", *written(room, tmp_path), *own, "--K-target", "200", "200", "160", "120"]) == 2
     assert "--K-target is given without --K" in capsys.readouterr().err
 
 
@@ -268,7 +269,7 @@ def test_intrinsics_that_the_network_cannot_tell_are_no_pose(tmp_path: Path, cap
     files = write_pair(tmp_path)
     words = ["align", files["a"], files["b"], "--start", "adapter", "--json", "--preset", "mast3r"]
     for name, said in (("raising", "the battery is empty"), ("misshapen", "expected points hxwx3")):
-        assert cli.main([*words, "--set", f"start.adapter={name}"]) == 1
+        assert command.main([*words, "--set", f"start.adapter={name}"]) == 1
         out = json.loads(capsys.readouterr().out)
         assert (out["status"], out["T_target_source"], out["quality"]) == ("no_initial_pose", None, 0)
         assert out["reason"].startswith("no --K, and none by adapter: the adapter ") and said in out["reason"]
@@ -327,7 +328,7 @@ def test_the_documented_adapter_runs_as_it_stands(
     words += ["--set", f"start.weights={robot / 'my.pth'}", "--set", "start.min_confidence=1.01", "--json"]
     depths = ["--depth-source", files["a_mm"], "--depth-target", files["b_mm"]]
     for more in (depths, ["--preset", "mast3r"]):
-        assert cli.main([*words, *more]) == 1, "it knows nothing of rooms"
+        assert command.main([*words, *more]) == 1, "it knows nothing of rooms"
         out = json.loads(capsys.readouterr().out)
         assert out["status"] == "no_initial_pose" and out["T_target_source"] is None
         assert out["reason"].startswith("my_model: source first: ")

@@ -18,7 +18,8 @@ from safetensors.torch import save_file
 from test_cli import K_WORDS
 from test_mask2former import ADAPTER, HEAD, random_state
 
-from garps_core import Config, cli
+from garps_core import Config
+from garps_core.cli import command
 from garps_core.config import PRESETS
 from garps_core.config.start import TWO_VIEW
 from garps_core.models import depth_anything, two_view_in_use
@@ -74,7 +75,7 @@ def depths(files: Files, target: str = "b") -> list[str]:
 def aligned(capsys: Captured, files: Files, *words: str, target: str = "b") -> dict[str, Any]:
     """The answer, which is no pose: code 1, in numbers that are finite (JSON has no others here)."""
     capsys.readouterr()
-    code = cli.main(["align", files["a"], files[target], *words, "--json"])
+    code = command.main(["align", files["a"], files[target], *words, "--json"])
     captured = capsys.readouterr()
     assert code == 1, captured.err
     out: dict[str, Any] = json.loads(captured.out, parse_constant=lambda word: pytest.fail(f"{word} in JSON"))
@@ -87,7 +88,7 @@ def aligned(capsys: Captured, files: Files, *words: str, target: str = "b") -> d
 def refused(capsys: Captured, files: Files, *words: str, source: str = "a") -> str:
     """The one line that a mistake is answered with."""
     capsys.readouterr()
-    assert cli.main(["align", files[source], files["b"], *words]) == 2
+    assert command.main(["align", files[source], files["b"], *words]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and captured.out == "" and "Traceback" not in captured.err
     return captured.err
@@ -279,7 +280,7 @@ def test_what_is_not_installed_is_said_with_what_to_type(
     ):
         assert f"run `garps weights fetch {name}`" in refused(capsys, files, *words)
     capsys.readouterr()
-    assert cli.main(["weights", "fetch", MAST3R]) == 2
+    assert command.main(["weights", "fetch", MAST3R]) == 2
     assert f"{SHARE_ALIKE}: read it (" in (said := capsys.readouterr().err)
     assert "repeat with --accept-licence mast3r" in said
 
@@ -346,7 +347,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
     monkeypatch.setattr(two_view_in_use, "tensors_of", opened)
     for name in PRESETS:
         if name not in ("mast3r", "paper", "paper_full"):
-            assert cli.main(["align", files["a"], files["b"], *K_WORDS, *depths(files), "--preset", name]) in (0, 1)
+            assert command.main(["align", files["a"], files["b"], *K_WORDS, *depths(files), "--preset", name]) in (0, 1)
 
 
 @pytest.mark.parametrize("name", [PTH, *DUST3R])
@@ -355,7 +356,7 @@ def test_a_converted_file_is_the_same_network(
 ) -> None:
     """Under a name of one's own, with its kind, licence and variant inside; `check` knows it too."""
     source, target, kind = weights / BY_NAME[name].local, tmp_path / "mine.safetensors", BY_NAME[name].kind
-    assert cli.main(["weights", "convert", str(source), str(target)]) == 0
+    assert command.main(["weights", "convert", str(source), str(target)]) == 0
     printed = capsys.readouterr().out
     assert printed.count("left out: 4 tensors of downstream_head") == (2 if name == PTH else 0)
     assert f"licence as before: {SHARE_ALIKE}" in printed
@@ -365,5 +366,5 @@ def test_a_converted_file_is_the_same_network(
     answers = [aligned(capsys, files, *words, *with_weights(f"weights={of}"))["reason"] for of in (name, str(target))]
     assert answers[0] == answers[1]
     if name == "dust3r-linear":
-        assert cli.main(["weights", "check", str(target)]) == 1
+        assert command.main(["weights", "check", str(target)]) == 1
         assert "DUSt3R with a linear head, encoder 128 x 2, decoder 64 x 4, no descr" in capsys.readouterr().out

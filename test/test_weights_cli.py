@@ -9,7 +9,7 @@ import torch
 from golden_rule import keys, state
 from safetensors.torch import save_file
 
-from garps_core import cli
+from garps_core.cli import command
 from garps_core.errors import WeightsError
 from garps_core.models.check import drawn_room
 from garps_core.models.convert import needed
@@ -47,7 +47,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def weights(*words: object) -> int:
-    return cli.main(["weights", *map(str, words)])
+    return command.main(["weights", *map(str, words)])
 
 
 def refused(capsys: Printed, *words: object) -> str:
@@ -233,7 +233,7 @@ def test_a_file_of_anything_else_is_named(tmp_path: Path, capsys: Printed) -> No
     assert "a network that is not known here" in capsys.readouterr().out
     assert "not known here" in refused(capsys, "convert", tmp_path / "a.pth", tmp_path / "b.safetensors")
     assert "cannot read" in refused(capsys, "check", tmp_path / "none.pth")
-    assert cli.main(["weights"]) == 2
+    assert command.main(["weights"]) == 2
     assert "convert" in capsys.readouterr().out
 
 

@@ -18,7 +18,7 @@ import pytest
 import torch
 from test_weights_files import Marks
 
-from garps_core import cli
+from garps_core.cli import command
 from garps_core.errors import WeightsError
 from garps_core.weights import store
 from garps_core.weights.fetch import fetch
@@ -260,7 +260,7 @@ def test_the_command_shows_progress_and_asks_for_nothing_else(hub: Hub, tmp_path
 
 
 def test_the_command_refuses_with_one_line(hub: Hub, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["weights", "fetch", "mast3r"]) == 2
+    assert command.main(["weights", "fetch", "mast3r"]) == 2
     captured = capsys.readouterr()
     assert captured.out.startswith("mast3r: licence CC BY-NC-SA 4.0")
     assert captured.err.count("\n") == 1

@@ -13,7 +13,8 @@ from torch import Tensor
 from garps_core.config import Alignment, Config, Rung
 from garps_core.devices import checked_device
 from garps_core.geometry import Array, se3_inverse
-from garps_core.objective.shape import Pairs, neighbours, on_compiled_path, pack
+from garps_core.objective import neighbours
+from garps_core.objective.shape import Pairs, on_compiled_path, pack
 from garps_core.types import Frustum, Mixture
 
 NEAREST_Z_M = 1e-3

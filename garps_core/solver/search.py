@@ -3,7 +3,7 @@
 
 Kernels of a coarse rung are blurred by decimetres, so that surfaces pull from where a guess leaves them. Even so an
 optimum is only found from some tens of degrees, hence beginnings that are turned about the camera's axes, ranked by the
-objective. Brightness finds its own (`brightness_search.py`), in places with little shape; bare walls are found by shape.
+objective. Brightness (`brightness_search.py`) finds places with little shape; bare walls are found by shape.
 The prior holds all of them together: it is as wide as the guess.
 """
 

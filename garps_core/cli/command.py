@@ -16,19 +16,19 @@ from scipy.spatial.transform import Rotation
 from garps_core import __version__
 from garps_core.align import align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
+from garps_core.cli.image_files import read_image, read_view
+from garps_core.cli.report import as_json, as_text
+from garps_core.cli.weights import app as weights_app
 from garps_core.config import METHODS, PRESETS, Config, Reconstruction, preset_for
 from garps_core.config.combinations import check_settings
 from garps_core.config.start import STARTS, TWO_VIEW
 from garps_core.config.text import changed_config, read_settings
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
-from garps_core.files import read_image, read_view
 from garps_core.mixtures.splat_reader import read_splats
-from garps_core.report import as_json, as_text
 from garps_core.start.initialise import identity
 from garps_core.start.intrinsics import estimate_intrinsics
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.weights_cli import app as weights_app
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
@@ -151,7 +151,7 @@ def doctor() -> int:
     \b
     Exit code: 0 = all that is needed is here and works, 1 = not.
     """
-    from garps_core.doctor import examine
+    from garps_core.cli.doctor import examine
 
     rows, healthy = examine()
     for name, finding in rows:
@@ -287,11 +287,7 @@ def _write_extras(
 
         write_aligned(*mixtures, estimate.T_target_source, ply)
     if figure is not None:
-        from garps_core.figure import before_after
+        from garps_core.cli.figure import before_after
 
         start = np.eye(4) if estimate.initial is None else estimate.initial.T_target_source
         before_after(*mixtures, start, estimate.T_target_source, figure)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
