@@ -22,11 +22,8 @@ from garps_core.config import METHODS, PRESETS, Config, preset_for
 from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
 from garps_core.types import PoseEstimate, View
-from garps_ros.bags import Bag, BagError
 from garps_ros.cameras import CameraTopics
 from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
-from garps_ros.frames import Frames
-from garps_ros.outputs import Outputs
 from garps_ros.preparation import (
     check_method,
     completed,
@@ -35,9 +32,12 @@ from garps_ros.preparation import (
     needs_depth,
     settings_of_completed,
 )
-from garps_ros.session import record, stop_on_signals
-from garps_ros.summary import Summary
-from garps_ros.topics import choose_cameras
+from garps_ros.recording.bags import Bag, BagError
+from garps_ros.recording.frame_reader import Frames
+from garps_ros.recording.outputs import Outputs
+from garps_ros.recording.session import record, stop_on_signals
+from garps_ros.recording.summary import Summary
+from garps_ros.recording.topics import choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker
 from msg_adapters import NANOSECONDS
 
@@ -207,7 +207,7 @@ def _check_given(context: typer.Context, to_ros: bool) -> None:
 
 def _play(bag: Path, rate: float, loop: bool, topics: list[str], wait: float) -> int:
     try:
-        from garps_ros.playback import play  # imports rclpy, which offline replay does without
+        from garps_ros.recording.playback import play  # imports rclpy, which offline replay does without
     except ImportError as error:
         raise BagError(
             f"--to-ros needs ROS 2 with rclpy ({error}): source it (source /opt/ros/jazzy/setup.bash), or without ROS, "

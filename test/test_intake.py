@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from recordings import SECOND, START, write
 from ros_messages import camera_info, changed, image
 
-from garps_ros.bags import Bag
 from garps_ros.cameras import CameraTopics
-from garps_ros.frames import Frames
 from garps_ros.intake import DEPTH, IMAGE, JUMP_BACK_NS, STUBBORN, Intake
 from garps_ros.pairing import MAX_WAITING_LIVE, Pairer
+from garps_ros.recording.bags import Bag
+from garps_ros.recording.frame_reader import Frames
 
 MS = 1_000_000
 SLOP = 20 * MS

@@ -23,7 +23,8 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
 
-from garps_ros import playback, replay
+from garps_ros import replay
+from garps_ros.recording import playback
 
 ROOT = Path(__file__).resolve().parents[1]
 ROS1.register(get_types_from_msg("uint8 value", "made_up_msgs/msg/Thing"))

@@ -8,7 +8,7 @@ import recordings
 from recordings import PERIOD, START, camera, frames, write
 
 from garps_ros import replay
-from garps_ros.outputs import Outputs
+from garps_ros.recording.outputs import Outputs
 
 
 @pytest.fixture(autouse=True)

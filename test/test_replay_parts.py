@@ -17,10 +17,10 @@ from garps_core.errors import InputError, ReconstructionError
 from garps_core.geometry import se3_inverse
 from garps_core.types import View
 from garps_ros import replay
-from garps_ros.bags import BagError
 from garps_ros.cameras import CameraTopics
 from garps_ros.pairing import MAX_WAITING, Pairer
-from garps_ros.topics import choose_cameras
+from garps_ros.recording.bags import BagError
+from garps_ros.recording.topics import choose_cameras
 from garps_ros.tracking import KeyframeRule, KeyframeTracker, composed_covariance
 from garps_ros.views import frame_mismatch, view_from_messages
 from msg_adapters import MessageError

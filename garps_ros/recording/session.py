@@ -12,8 +12,8 @@ from types import FrameType
 import numpy as np
 
 from garps_ros.estimates import Origin, Outcome
-from garps_ros.outputs import Outputs
-from garps_ros.summary import Summary
+from garps_ros.recording.outputs import Outputs
+from garps_ros.recording.summary import Summary
 from msg_adapters import MessageError
 
 NOT_PUBLISHABLE = "not_publishable"

@@ -26,11 +26,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rosgraph_msgs.msg import Clock
 
-from garps_ros.bags import BagError
-from garps_ros.raw_bags import RawBag
-from garps_ros.routes import CLOCK_TOPIC, Route, open_routes
-from garps_ros.session import stop_on_signals
-from garps_ros.topics import IMAGE_TYPES
+from garps_ros.recording.bags import BagError
+from garps_ros.recording.raw_bags import RawBag
+from garps_ros.recording.routes import CLOCK_TOPIC, Route, open_routes
+from garps_ros.recording.session import stop_on_signals
+from garps_ros.recording.topics import IMAGE_TYPES
 from msg_adapters import NANOSECONDS
 
 INTERRUPTED = 130

@@ -15,8 +15,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
-from garps_ros.bags import BagError
-from garps_ros.raw_bags import RawBag
+from garps_ros.recording.bags import BagError
+from garps_ros.recording.raw_bags import RawBag
 from msg_adapters import MessageError
 
 CLOCK_TOPIC = "/clock"

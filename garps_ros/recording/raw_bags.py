@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.interfaces import ConnectionExtRosbag1, QosDurability
 from rosbags.typesys import Stores, get_typestore
 
-from garps_ros.bags import Bag
+from garps_ros.recording.bags import Bag
 from msg_adapters import MessageError
 
 HEADER = "std_msgs/msg/Header"
