@@ -10,7 +10,7 @@ from graph import SECOND, Camera, NodeProcess, Peer, room_pair
 
 from garps_core import Config, Status, estimate_relative_pose
 from garps_core.config.text import changed_config
-from garps_ros.views import view_from_messages
+from garps_ros.frames.frame import view_from_messages
 from msg_adapters import header_stamp_ns, pose_from_message
 
 pytest.importorskip("rclpy")

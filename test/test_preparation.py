@@ -14,12 +14,12 @@ from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
 from garps_core.models import depth_anything, in_use
 from garps_ros import preparation, replay
-from garps_ros.assembly import DEPTH, IMAGE, Assembly
 from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.estimates import Origin
+from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
+from garps_ros.frames.frame import view_from_messages
 from garps_ros.settings import NodeSettings
 from garps_ros.solver import Job, Solver
-from garps_ros.views import view_from_messages
 from msg_adapters import header_stamp_ns
 
 pytest.importorskip("embreex")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from garps_ros.cameras import CameraTopics, Frame
-from garps_ros.pairing import Pairer
+from garps_ros.frames.stamps import Pairer
 from msg_adapters import MessageError, header_stamp_ns
 
 IMAGE, DEPTH = 0, 1
