@@ -18,13 +18,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from garps_core.errors import GarpsError
 from garps_ros.cameras import Frame
-from garps_ros.estimates import Origin, Outcome
+from garps_ros.estimates.outcomes import Origin, Outcome
+from garps_ros.estimates.preparation import needs_depth
 from garps_ros.health import Health, memory
 from garps_ros.inputs import Takers, camera_topics, subscribe
 from garps_ros.intake import Intake
 from garps_ros.log import Log
 from garps_ros.node_parameters import NodeParameters
-from garps_ros.preparation import needs_depth
 from garps_ros.priors import Priors
 from garps_ros.publishing import Publishing
 from garps_ros.remarks import note_outcome, note_result

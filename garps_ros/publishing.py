@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
 from garps_core.checks import Float64Array
-from garps_ros.estimates import Outcome
+from garps_ros.estimates.outcomes import Outcome
 from garps_ros.health import Finding
 from garps_ros.inputs import SIDES
 from garps_ros.log import Log

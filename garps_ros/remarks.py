@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from garps_ros.estimates import Outcome
+from garps_ros.estimates.outcomes import Outcome
 from garps_ros.health import Health
 from garps_ros.log import Log
 from garps_ros.solver import Result

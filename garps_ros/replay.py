@@ -23,8 +23,9 @@ from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
 from garps_core.types import PoseEstimate, View
 from garps_ros.cameras import CameraTopics
-from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
-from garps_ros.preparation import (
+from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
+from garps_ros.estimates.outcomes import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
+from garps_ros.estimates.preparation import (
     check_method,
     completed,
     depth_share,
@@ -38,7 +39,6 @@ from garps_ros.recording.outputs import Outputs
 from garps_ros.recording.session import record, stop_on_signals
 from garps_ros.recording.summary import Summary
 from garps_ros.recording.topics import choose_cameras
-from garps_ros.tracking import KeyframeRule, KeyframeTracker
 from msg_adapters import NANOSECONDS
 
 NAME = "garps-replay"

@@ -20,8 +20,17 @@ from garps_core.config import Config
 from garps_core.geometry import se3_inverse
 from garps_core.types import Mixture, PoseEstimate, Prior, View
 from garps_ros.cameras import Frame
-from garps_ros.estimates import Origin, Outcome, ViewReader, estimate_pair, failed_outcome, follow_frame, frame_names
-from garps_ros.preparation import (
+from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
+from garps_ros.estimates.outcomes import (
+    Origin,
+    Outcome,
+    ViewReader,
+    estimate_pair,
+    failed_outcome,
+    follow_frame,
+    frame_names,
+)
+from garps_ros.estimates.preparation import (
     completed,
     depth_share,
     load_networks,
@@ -31,7 +40,6 @@ from garps_ros.preparation import (
 )
 from garps_ros.priors import prior_from_message
 from garps_ros.settings import NodeSettings
-from garps_ros.tracking import KeyframeRule, KeyframeTracker
 from msg_adapters import MessageError, header_frame_id
 
 IN_CORE = ("depth", "estimate")

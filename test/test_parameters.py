@@ -13,10 +13,10 @@ from garps_core.config import PRESETS, Config
 from garps_core.config.field import Checked, setting
 from garps_core.errors import ConfigError
 from garps_ros import parameter_docs
+from garps_ros.estimates.keyframes import KeyframeRule
 from garps_ros.parameters import parameters, settings_from
 from garps_ros.replay import replay
 from garps_ros.settings import NodeSettings
-from garps_ros.tracking import KeyframeRule
 
 ROOT = Path(__file__).resolve().parent.parent
 LADDERS = ("alignment.ladder", "alignment.search", "alignment.search_ladder")

@@ -13,9 +13,10 @@ from garps_core import Config, estimate_relative_pose
 from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
 from garps_core.models import depth_anything, in_use
-from garps_ros import preparation, replay
+from garps_ros import replay
 from garps_ros.cameras import CameraTopics, Frame
-from garps_ros.estimates import Origin
+from garps_ros.estimates import preparation
+from garps_ros.estimates.outcomes import Origin
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
 from garps_ros.frames.frame import view_from_messages
 from garps_ros.settings import NodeSettings

@@ -18,11 +18,11 @@ from garps_core.geometry import se3_inverse
 from garps_core.types import View
 from garps_ros import replay
 from garps_ros.cameras import CameraTopics
+from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker, composed_covariance
 from garps_ros.frames.frame import frame_mismatch, view_from_messages
 from garps_ros.frames.stamps import MAX_WAITING, Pairer
 from garps_ros.recording.bags import BagError
 from garps_ros.recording.topics import choose_cameras
-from garps_ros.tracking import KeyframeRule, KeyframeTracker, composed_covariance
 from msg_adapters import MessageError
 
 

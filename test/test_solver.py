@@ -21,10 +21,10 @@ from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.types import PoseEstimate, Prior, Status
 from garps_ros import solver
 from garps_ros.cameras import CameraTopics, Frame
-from garps_ros.estimates import Origin, ViewReader, estimate_keyframes, estimate_pair
+from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
+from garps_ros.estimates.outcomes import Origin, ViewReader, estimate_keyframes, estimate_pair
 from garps_ros.settings import NodeSettings
 from garps_ros.solver import Job, Solver
-from garps_ros.tracking import KeyframeRule, KeyframeTracker
 from msg_adapters import PoseWriter
 
 LIBRARIES = ("rclpy", "rosbags")

@@ -11,7 +11,7 @@ from types import FrameType
 
 import numpy as np
 
-from garps_ros.estimates import Origin, Outcome
+from garps_ros.estimates.outcomes import Origin, Outcome
 from garps_ros.recording.outputs import Outputs
 from garps_ros.recording.summary import Summary
 from msg_adapters import MessageError

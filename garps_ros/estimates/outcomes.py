@@ -11,8 +11,8 @@ from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
 from garps_ros.cameras import Frame
+from garps_ros.estimates.keyframes import Estimator, KeyframeTracker
 from garps_ros.frames.frame import frame_mismatch, view_from_messages
-from garps_ros.tracking import Estimator, KeyframeTracker
 from msg_adapters import MessageError, header_frame_id
 
 FAILURES: dict[type[Exception], str] = {

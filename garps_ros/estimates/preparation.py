@@ -19,7 +19,7 @@ from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.objective import compiled
 from garps_core.types import Prior, View
-from garps_ros.tracking import MIN_DEPTH_SHARE
+from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
 NETWORKS = (*DEPTH_NETWORKS, "flash3d", "two_view")
 """Methods that ask a network for depth; the others need the sensor's."""
