@@ -93,7 +93,7 @@ def _start(words: list[str]) -> tuple[Any, Any, Any]:
     from rclpy.node import Node
 
     from garps_core.errors import ConfigError
-    from garps_ros.node import PoseNode
+    from garps_ros.live.node import PoseNode
 
     rclpy.init(args=words, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     unknown = rclpy.utilities.remove_ros_args(words)[1:]

@@ -93,7 +93,7 @@ class NodeProcess:
 
 NURSERY = """
 import json, os, sys
-import garps_ros.node  # torch and ROS; neither has begun a thread yet
+import garps_ros.live.node  # torch and ROS; neither has begun a thread yet
 from garps_ros.pose_node import main
 for line in sys.stdin:
     order = json.loads(line)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from recordings import SECOND, START
 
-from garps_ros.arrivals import FEW, MANY_MISSING, PAUSE_S, WINDOW, Arrivals
+from garps_ros.live.arrivals import FEW, MANY_MISSING, PAUSE_S, WINDOW, Arrivals
 
 
 def arrived(stamps_s, times_s=None, delay_s=0.0):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from recordings import SECOND, START
 
-from garps_ros.arrivals import Arrivals
-from garps_ros.health import WINDOW, Health, InputState, Level, memory
+from garps_ros.live.arrivals import Arrivals
+from garps_ros.live.health import WINDOW, Health, InputState, Level, memory
 
 NOW, TIMEOUT, SLOP = 1000.0, 5.0, 0.02
 IMAGE = InputState("source/image", "/right/image_rect", Arrivals(), 1, "RELIABLE")

@@ -203,7 +203,7 @@ def node_topics() -> set[str]:
     """What the pose node subscribes and publishes, as a running one says; a process of its own that meets nobody."""
     pytest.importorskip("rclpy")
     code = (
-        "import rclpy; from rclpy.node import Node; from garps_ros.node import PoseNode; rclpy.init()\n"
+        "import rclpy; from rclpy.node import Node; from garps_ros.live.node import PoseNode; rclpy.init()\n"
         "ros = Node('pose_node'); node = PoseNode(ros)\n"
         "print('TOPICS', *(end.topic_name for end in (*ros.subscriptions, *ros.publishers)))\n"
         "node.stop(5.0); ros.destroy_node(); rclpy.shutdown()"

@@ -18,7 +18,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from garps_ros.publishing import message_class
+from garps_ros.live.publishing import message_class
 
 TRANSPORTS = {
     "raw_offered_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=auto"]),

@@ -17,8 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from recordings import COVARIANCE, moved
 
 from garps_core.types import PoseEstimate, Status
-from garps_ros import solver
-from garps_ros.node import PoseNode
+from garps_ros.live import estimator
+from garps_ros.live.node import PoseNode
 from msg_adapters import header_stamp_ns
 
 
@@ -93,7 +93,7 @@ def estimates(monkeypatch):
         found = PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9) if fault is None else fault()
         return found, None
 
-    monkeypatch.setattr(solver, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(estimator, "estimate_with_mixtures", estimate)
     return Estimates
 
 

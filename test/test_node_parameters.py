@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter
 
 from garps_core.config import Config
 from garps_core.errors import ConfigError
-from garps_ros.node_parameters import NodeParameters
+from garps_ros.live.node_parameters import NodeParameters
 from garps_ros.parameters import parameters
 from garps_ros.settings import NodeSettings
 

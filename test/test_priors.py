@@ -6,7 +6,7 @@ import pytest
 from recordings import COVARIANCE, SECOND, START, moved
 from ros_messages import header, message_class
 
-from garps_ros.priors import KEPT, Priors, prior_from_message
+from garps_ros.live.priors import KEPT, Priors, prior_from_message
 from msg_adapters import MessageError, PoseWriter
 
 LIBRARIES = ("rclpy", "rosbags")

@@ -19,12 +19,12 @@ from garps_core.errors import InputError
 from garps_core.geometry import se3_inverse
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.types import PoseEstimate, Prior, Status
-from garps_ros import solver
 from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
 from garps_ros.estimates.outcomes import Origin, ViewReader, estimate_keyframes, estimate_pair
+from garps_ros.live import estimator
+from garps_ros.live.estimator import Job, Solver
 from garps_ros.settings import NodeSettings
-from garps_ros.solver import Job, Solver
 from msg_adapters import PoseWriter
 
 LIBRARIES = ("rclpy", "rosbags")
@@ -63,13 +63,13 @@ def calls(monkeypatch):
         calls.append(given)
         return with_mixtures(replace(recordings.estimate(*given[:2]), initial=given[3]), *given[:2])
 
-    monkeypatch.setattr(solver, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(estimator, "estimate_with_mixtures", estimate)
     return calls
 
 
 def answering(monkeypatch, estimate):
     """Let the estimator be `estimate(source, target)`."""
-    monkeypatch.setattr(solver, "estimate_with_mixtures", lambda s, t, *_: with_mixtures(estimate(s, t), s, t))
+    monkeypatch.setattr(estimator, "estimate_with_mixtures", lambda s, t, *_: with_mixtures(estimate(s, t), s, t))
 
 
 def with_mixtures(estimate, *views):
@@ -310,8 +310,8 @@ def test_stage_and_times_are_those_of_the_work(monkeypatch):
         return recordings.estimate(source, target, bad=(3,))
 
     answering(monkeypatch, estimate)
-    cloud = solver._cloud
-    monkeypatch.setattr(solver, "_cloud", lambda *given: (stages.append(by.stage), cloud(*given))[1])
+    cloud = estimator._cloud
+    monkeypatch.setattr(estimator, "_cloud", lambda *given: (stages.append(by.stage), cloud(*given))[1])
     by = Solver(lambda _: stages.append(by.stage))
     assert by.stage == ""
     began = time.monotonic()
@@ -363,11 +363,11 @@ def test_with_a_keyframe_both_clouds_lie_in_the_frame_of_the_first(monkeypatch):
 
 def test_clouds_are_made_when_asked_for_and_when_there_is_a_pose(monkeypatch, calls):
     assert solve(*pair()).clouds is None and solve(*pair(), clouds=True).clouds is not None
-    cloud = solver._cloud
-    monkeypatch.setattr(solver, "_cloud", None)  # would be an error that nobody expected
+    cloud = estimator._cloud
+    monkeypatch.setattr(estimator, "_cloud", None)  # would be an error that nobody expected
     broken = solve(*pair(), clouds=True)
     assert broken.clouds is None and "TypeError" in broken.trace and broken.outcomes[0].T is not None
-    monkeypatch.setattr(solver, "_cloud", cloud)
+    monkeypatch.setattr(estimator, "_cloud", cloud)
     answering(monkeypatch, lambda *_: PoseEstimate(Status.POOR_FIT, "no", moved(0.1), COVARIANCE))
     bad = solve(*pair(), clouds=True)
     assert (bad.clouds, bad.trace, bad.outcomes[0].row.status) == (None, "", "poor_fit")

@@ -24,11 +24,11 @@ from rclpy.qos import DurabilityPolicy
 from recordings import START, camera, moved
 from ros_messages import rclpy_class
 
-from garps_ros import solver
-from garps_ros.intake import DEPTH, IMAGE
-from garps_ros.log import Log
-from garps_ros.node import PoseNode
-from garps_ros.transforms import RECENT, Transforms
+from garps_ros.live import estimator
+from garps_ros.live.intake import DEPTH, IMAGE
+from garps_ros.live.log import Log
+from garps_ros.live.node import PoseNode
+from garps_ros.live.transforms import RECENT, Transforms
 from msg_adapters import MessageError, PoseWriter
 
 
@@ -179,7 +179,7 @@ def test_what_cannot_be_a_transform_is_not_sent(topics, transforms):
 
 
 def test_many_frames_do_not_fill_the_memory(topics, transforms, monkeypatch):
-    monkeypatch.setattr("garps_ros.transforms.MOST_FRAMES", 5)
+    monkeypatch.setattr("garps_ros.live.transforms.MOST_FRAMES", 5)
     for index in range(20):
         topics.other("map", f"f{index}")
     assert len(transforms._parents) == 5
@@ -206,7 +206,7 @@ def ros(monkeypatch, tmp_path):
 
 
 def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd):
-    monkeypatch.setattr(solver, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
+    monkeypatch.setattr(estimator, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
     node = PoseNode(ros)
     executor = SingleThreadedExecutor(context=ros.context)
     executor.add_node(ros)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from garps_ros.worker import Worker
+from garps_ros.live.worker import Worker
 
 LIMIT_S = 20
 

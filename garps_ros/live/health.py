@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from garps_ros.arrivals import MANY_MISSING, Arrivals
+from garps_ros.live.arrivals import MANY_MISSING, Arrivals
 
 WINDOW = 200
 """Results that latencies look back on."""

@@ -16,8 +16,8 @@ from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEve
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
-from garps_ros.arrivals import MANY_MISSING, Arrivals
-from garps_ros.health import InputState
+from garps_ros.live.arrivals import MANY_MISSING, Arrivals
+from garps_ros.live.health import InputState
 
 QUEUE = 10
 """Messages that wait for the executor; at 30 Hz a third of a second."""

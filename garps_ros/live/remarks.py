@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from garps_ros.estimates.outcomes import Outcome
-from garps_ros.health import Health
-from garps_ros.log import Log
-from garps_ros.solver import Result
+from garps_ros.live.estimator import Result
+from garps_ros.live.health import Health
+from garps_ros.live.log import Log
 
 
 def note_result(result: Result, health: Health, log: Log) -> None:

@@ -38,7 +38,7 @@ from garps_ros.estimates.preparation import (
     settings_of_completed,
     warm_up,
 )
-from garps_ros.priors import prior_from_message
+from garps_ros.live.priors import prior_from_message
 from garps_ros.settings import NodeSettings
 from msg_adapters import MessageError, header_frame_id
 

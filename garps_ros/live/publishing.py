@@ -18,11 +18,11 @@ from sensor_msgs.msg import PointCloud2
 
 from garps_core.checks import Float64Array
 from garps_ros.estimates.outcomes import Outcome
-from garps_ros.health import Finding
-from garps_ros.inputs import SIDES
-from garps_ros.log import Log
-from garps_ros.solver import Cloud
-from garps_ros.transforms import Transforms
+from garps_ros.live.estimator import Cloud
+from garps_ros.live.health import Finding
+from garps_ros.live.inputs import SIDES
+from garps_ros.live.log import Log
+from garps_ros.live.transforms import Transforms
 from msg_adapters import CloudWriter, MessageError, PoseWriter
 
 QOS = QoSProfile(depth=10)  # reliable, keep last, volatile: what navigation subscribes to

@@ -20,16 +20,16 @@ from garps_core.errors import GarpsError
 from garps_ros.cameras import Frame
 from garps_ros.estimates.outcomes import Origin, Outcome
 from garps_ros.estimates.preparation import needs_depth
-from garps_ros.health import Health, memory
-from garps_ros.inputs import Takers, camera_topics, subscribe
-from garps_ros.intake import Intake
-from garps_ros.log import Log
-from garps_ros.node_parameters import NodeParameters
-from garps_ros.priors import Priors
-from garps_ros.publishing import Publishing
-from garps_ros.remarks import note_outcome, note_result
-from garps_ros.solver import Job, Result, Solver
-from garps_ros.worker import Worker
+from garps_ros.live.estimator import Job, Result, Solver
+from garps_ros.live.health import Health, memory
+from garps_ros.live.inputs import Takers, camera_topics, subscribe
+from garps_ros.live.intake import Intake
+from garps_ros.live.log import Log
+from garps_ros.live.node_parameters import NodeParameters
+from garps_ros.live.priors import Priors
+from garps_ros.live.publishing import Publishing
+from garps_ros.live.remarks import note_outcome, note_result
+from garps_ros.live.worker import Worker
 from msg_adapters import NANOSECONDS, MessageError
 
 OFTEN_S = 0.2
