@@ -24,7 +24,7 @@ import pytest
 import yaml
 
 from garps_core.errors import ConfigError
-from garps_ros.parameters import parameters, settings_from
+from garps_ros.parameters.parameter import parameters, settings_from
 
 ROOT = Path(__file__).resolve().parent.parent
 LAUNCH_FILE = ROOT / "launch" / "garps.launch.py"

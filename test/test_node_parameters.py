@@ -20,8 +20,8 @@ from rclpy.parameter import Parameter
 from garps_core.config import Config
 from garps_core.errors import ConfigError
 from garps_ros.live.node_parameters import NodeParameters
-from garps_ros.parameters import parameters
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.parameter import parameters
+from garps_ros.parameters.settings import NodeSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE}

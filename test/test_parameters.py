@@ -12,11 +12,11 @@ import pytest
 from garps_core.config import PRESETS, Config
 from garps_core.config.field import Checked, setting
 from garps_core.errors import ConfigError
-from garps_ros import parameter_docs
 from garps_ros.estimates.keyframes import KeyframeRule
-from garps_ros.parameters import parameters, settings_from
+from garps_ros.parameters import docs
+from garps_ros.parameters.parameter import parameters, settings_from
+from garps_ros.parameters.settings import NodeSettings
 from garps_ros.replay import replay
-from garps_ros.settings import NodeSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 LADDERS = ("alignment.ladder", "alignment.search", "alignment.search_ladder")
@@ -169,37 +169,37 @@ def test_an_unknown_preset_has_no_parameters() -> None:
 
 
 def test_the_description_needs_no_ros() -> None:
-    code = "import garps_ros.parameters, sys; print('rclpy' in sys.modules)"
+    code = "import garps_ros.parameters.parameter, sys; print('rclpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.stdout.strip() == "False", done.stderr
 
 
 def test_the_page_and_the_file_are_current() -> None:
-    assert parameter_docs.main(["--check"]) == 0, "run python -m garps_ros.parameter_docs"
+    assert docs.main(["--check"]) == 0, "run python -m garps_ros.parameters.docs"
 
 
 def test_a_stale_page_is_noticed_and_written_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "setup.py").touch()
     root = ["--root", str(tmp_path)]
-    assert parameter_docs.main([*root, "--check"]) == 1
+    assert docs.main([*root, "--check"]) == 1
     assert not (tmp_path / "docs").exists()
     assert "docs/parameters.md is stale" in capsys.readouterr().err
-    assert parameter_docs.main(root) == 0
-    assert parameter_docs.main([*root, "--check"]) == 0
+    assert docs.main(root) == 0
+    assert docs.main([*root, "--check"]) == 0
     page = tmp_path / "docs/parameters.md"
     page.write_text(page.read_text() + "edited")
-    assert parameter_docs.main([*root, "--check"]) == 1
-    assert parameter_docs.main(root) == 0 and page.read_text() == parameter_docs.page()
+    assert docs.main([*root, "--check"]) == 1
+    assert docs.main(root) == 0 and page.read_text() == docs.page()
 
 
 def test_only_a_checkout_is_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        parameter_docs.main(["--root", str(tmp_path)])
+        docs.main(["--root", str(tmp_path)])
     assert "is no checkout" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_the_page_has_a_row_for_every_parameter() -> None:
-    rows = [line for line in parameter_docs.page().splitlines() if line.startswith("| `")]
+    rows = [line for line in docs.page().splitlines() if line.startswith("| `")]
     assert [row.split("`")[1] for row in rows] == [parameter.name for parameter in parameters()]
     assert all(row.count(" | ") == 6 for row in rows)
     (row,) = [row for row in rows if "`lifting.noise_linear`" in row]
@@ -216,4 +216,4 @@ def test_the_page_has_a_row_for_every_parameter() -> None:
     [(5.0, "5.0"), (1e-5, "1.0e-05"), (1.5e-7, "1.5e-07"), (1e6, "1000000.0"), (3, "3"), (True, "true"), ("a", '"a"')],
 )
 def test_values_are_written_with_their_type(value: object, text: str) -> None:
-    assert parameter_docs.written(value) == text
+    assert docs.written(value) == text

@@ -20,7 +20,7 @@ from garps_ros.estimates.outcomes import Origin
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
 from garps_ros.frames.frame import view_from_messages
 from garps_ros.live.estimator import Job, Solver
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.settings import NodeSettings
 from msg_adapters import header_stamp_ns
 
 pytest.importorskip("embreex")

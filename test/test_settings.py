@@ -85,7 +85,7 @@ def test_the_command_takes_one(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_the_node_takes_the_same(tmp_path: Path) -> None:
     """The names of a written file are parameters of the node, of the types that it wants."""
-    from garps_ros.parameters import parameters, settings_from
+    from garps_ros.parameters.parameter import parameters, settings_from
 
     write_settings(tmp_path / "a.yaml", "monocular", {"alignment.information": 6.0, "lifting.stride": 4})
     found = read_settings(tmp_path / "a.yaml")

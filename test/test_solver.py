@@ -24,7 +24,7 @@ from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
 from garps_ros.estimates.outcomes import Origin, ViewReader, estimate_keyframes, estimate_pair
 from garps_ros.live import estimator
 from garps_ros.live.estimator import Job, Solver
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.settings import NodeSettings
 from msg_adapters import PoseWriter
 
 LIBRARIES = ("rclpy", "rosbags")

@@ -39,7 +39,7 @@ from garps_ros.estimates.preparation import (
     warm_up,
 )
 from garps_ros.live.priors import prior_from_message
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.settings import NodeSettings
 from msg_adapters import MessageError, header_frame_id
 
 IN_CORE = ("depth", "estimate")

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from garps_ros.cameras import CameraTopics
 from garps_ros.frames.assembly import DEPTH, IMAGE
 from garps_ros.live.subscriptions import Input
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.settings import NodeSettings
 
 SIDES = ("source", "target")
 

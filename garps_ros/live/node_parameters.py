@@ -21,8 +21,8 @@ from garps_core.config import Config
 from garps_core.devices import checked_device
 from garps_core.errors import ConfigError
 from garps_ros.estimates.preparation import check_method
-from garps_ros.parameters import Parameter, no_such_parameter, parameters, settings_from
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.parameter import Parameter, no_such_parameter, parameters, settings_from
+from garps_ros.parameters.settings import NodeSettings
 
 Type = rclpy.parameter.Parameter.Type
 TYPES = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}

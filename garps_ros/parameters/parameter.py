@@ -11,7 +11,7 @@ from typing import Any
 
 from garps_core.config import Config
 from garps_core.errors import ConfigError
-from garps_ros.settings import NodeSettings
+from garps_ros.parameters.settings import NodeSettings
 
 Value = bool | int | float | str
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes docs/parameters.md and config/garps.yaml from the parameters themselves.
 
-`python -m garps_ros.parameter_docs` writes both, `--check` only says (exit code 1) whether one of them is stale.
+`python -m garps_ros.parameters.docs` writes both, `--check` only says (exit code 1) whether one of them is stale.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from itertools import groupby
 from pathlib import Path
 
 from garps_core.config import PRESETS
-from garps_ros.parameters import Parameter, Value, parameters
+from garps_ros.parameters.parameter import Parameter, Value, parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
@@ -33,8 +33,8 @@ INDENT = " " * 4
 INTRODUCTION = """\
 # Parameters of the live node
 
-Generated from the settings in `garps_ros/settings.py` and `garps_core/config/config.py`; change those, then run
-`python -m garps_ros.parameter_docs`.
+Generated from the settings in `garps_ros/parameters/settings.py` and `garps_core/config/config.py`; change those, then run
+`python -m garps_ros.parameters.docs`.
 
 `pose_node` has two kinds of parameters: its own, and every setting of the estimator under the name it has everywhere
 else (`lifting.stride` here is `--set lifting.stride=4` of `garps-replay`). `preset` chooses the values that the
@@ -79,7 +79,7 @@ is fixed at the start.
 
 FILE_HEAD = """\
 # SPDX-License-Identifier: Apache-2.0
-# Every parameter of pose_node with its default: meaning [range, unit]. Generated: python -m garps_ros.parameter_docs
+# Every parameter of pose_node with its default: meaning [range, unit]. Generated: python -m garps_ros.parameters.docs
 # A double needs its point (5.0, never 5); text that looks like something else needs quotes ("true").
 # The estimator's settings are commented out (#name) so that `preset` decides them; without its # one stands above it.
 /**:
@@ -159,7 +159,7 @@ def _entry(parameter: Parameter) -> Iterator[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write both files; with --check write nothing and return 1 when one of them is stale."""
-    parser = argparse.ArgumentParser(prog="python -m garps_ros.parameter_docs", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m garps_ros.parameters.docs", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 when a file is stale")
     parser.add_argument("--root", type=Path, default=ROOT, help="the checkout to write into")
     options = parser.parse_args(arguments)
@@ -172,7 +172,7 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         stale = True
         if options.check:
-            print(f"{path} is stale: run python -m garps_ros.parameter_docs", file=sys.stderr)
+            print(f"{path} is stale: run python -m garps_ros.parameters.docs", file=sys.stderr)
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(text, encoding="utf-8")
