@@ -17,7 +17,7 @@ from pathlib import Path
 from garps_core.config import PRESETS
 from garps_ros.parameters.parameter import Parameter, Value, parameters
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 GROUPS = {
     "node": ("The node", "What is subscribed, paired and published."),
@@ -33,7 +33,7 @@ INDENT = " " * 4
 INTRODUCTION = """\
 # Parameters of the live node
 
-Generated from the settings in `garps_ros/parameters/settings.py` and `garps_core/config/config.py`; change those, then run
+Generated from the settings in `garps_ros/parameters/settings.py` and `garps_core/config/`; change those, then run
 `python -m garps_ros.parameters.docs`.
 
 `pose_node` has two kinds of parameters: its own, and every setting of the estimator under the name it has everywhere
