@@ -20,9 +20,9 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.networks import counted_flop
-from bench.networks_pair import peak_mib, seconds_of
-from bench.speed_parts import Check, Row, Section, markdown
+from bench.networks.__main__ import counted_flop
+from bench.networks.pair import peak_mib, seconds_of
+from bench.speed.parts import Check, Row, Section, markdown
 from bench.tables import machine_facts
 from garps_core.models.mast3r import NaverModel, prepared
 from garps_core.models.two_view import Architecture, Stack, TwoView

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from bench import demo
-from bench.demo_bag import stamp_ns_of, write_bag
+from bench.demo import __main__ as demo
+from bench.demo.bag import stamp_ns_of, write_bag
 from bench.stereo import StereoPair, depth_of_both
 from msg_adapters import depth_image, rgb_image
 
@@ -56,7 +56,7 @@ def test_the_bag_holds_what_was_put_in(tmp_path: Path) -> None:
 
 def test_the_node_finds_the_baseline_live_and_ends_well(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
-    from bench.demo_live import run_live
+    from bench.demo.live import run_live
 
     pair = fronto_parallel(12)
     depths = depth_of_both(pair)
@@ -74,7 +74,7 @@ def test_the_node_finds_the_baseline_live_and_ends_well(tmp_path: Path) -> None:
 def test_a_machine_without_ros_leaves_the_live_part_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "bench.demo_live", raising=False)
+    monkeypatch.delitem(sys.modules, "bench.demo.live", raising=False)
     for name in ("rclpy", "geometry_msgs.msg"):
         monkeypatch.setitem(sys.modules, name, None)
     assert demo.live_part(tmp_path, 12)

@@ -168,7 +168,7 @@ def test_it_is_called_a_demonstration(
 def test_two_plain_images_give_a_pose_on_the_command_line(
     rooms, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from bench.demo_rgb import written
+    from bench.demo.rgb import written
 
     pair = rooms[0]
     words = written(pair, tmp_path)

@@ -9,16 +9,17 @@ import torch
 import typer
 from surfaces import TRUTH, look, random_pose
 
-from bench import speed, speed_fresh
 from bench.autograd import PlainObjective
 from bench.datasets import Pair, scene_points
-from bench.speed_determinism import determinism_section
-from bench.speed_growth import growth_section, slopes, subset
-from bench.speed_memory import memory_section
-from bench.speed_pairs import CHAIN, GARPS, pairs_section
-from bench.speed_parts import Check, Inputs, Section, interleaved, markdown, threads
-from bench.speed_solver import autograd_section, contest, paper_section, plain, start_of
-from bench.speed_stream import _loop, _planes, _torch_stream, exact_pairs, reference, stream_section
+from bench.speed import __main__ as speed
+from bench.speed import fresh
+from bench.speed.determinism import determinism_section
+from bench.speed.growth import growth_section, slopes, subset
+from bench.speed.memory import memory_section
+from bench.speed.pairs import CHAIN, GARPS, pairs_section
+from bench.speed.parts import Check, Inputs, Section, interleaved, markdown, threads
+from bench.speed.solver import autograd_section, contest, paper_section, plain, start_of
+from bench.speed.stream import _loop, _planes, _torch_stream, exact_pairs, reference, stream_section
 from garps_core import Config, Prior
 from garps_core.geometry import se3_inverse
 from garps_core.solver import paper
@@ -34,7 +35,7 @@ def inputs():
 def test_the_digest_sees_one_bit(inputs):
     def digest_of(T):
         found = contest(inputs, 1).align("second order")
-        return speed_fresh.digest(type(found)(found.status, "", T, found.covariance))
+        return fresh.digest(type(found)(found.status, "", T, found.covariance))
 
     T = TRUTH.copy()
     T[0, 3] = np.nextafter(T[0, 3], 1)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.speed_fresh import arrays_of, arrays_of_mixtures, in_fresh_process
-from bench.speed_growth import fine_mixtures, subset
-from bench.speed_parts import Check, Inputs, Row, Section
+from bench.speed.fresh import arrays_of, arrays_of_mixtures, in_fresh_process
+from bench.speed.growth import fine_mixtures, subset
+from bench.speed.parts import Check, Inputs, Row, Section
 
 COMPONENTS, NEIGHBOURS = 100_000, 20
 BAR_MIB = 1024.0

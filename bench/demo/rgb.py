@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from bench.datasets import scene_points
-from bench.demo_picture import with_inputs
+from bench.demo.picture import with_inputs
 from bench.depth_errors import depth_errors
 from bench.rooms import RoomPair, make_pair
 from garps_core import View, metrics

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from torch import Tensor
 
-from bench.speed_parts import Check, Inputs, Row, Section, imported_numba, interleaved, medians, threads
+from bench.speed.parts import Check, Inputs, Row, Section, imported_numba, interleaved, medians, threads
 from garps_core import Config, Mixture
 from garps_core.checks import Float64Array
 from garps_core.config import Rung

@@ -6,7 +6,7 @@
    baseline: what is tested is the alignment, not the depth. The rectification is good to about 0.2 px, 0.03 deg.)
 2. Room: two views 0.6 m and 20 degrees apart with a depth sensor's noise; the truth is exact. Once from the images
    alone, once from a rough pose (0.12 m and 3 degrees off) as odometry would give it; that one is the picture.
-3. Two plain images of a generated room, without depth: that comes from the network in the package (`bench.demo_rgb`).
+3. Two plain images of a generated room, without depth: that comes from the network in the package (`bench.demo.rgb`).
 4. Live: `pose_node` in a process of its own, the stereo pairs played into it over ROS 2, its poses as they come.
    Left out where rclpy is not installed.
 """
@@ -30,9 +30,9 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from bench.demo_bag import stamp_ns_of, write_bag
-from bench.demo_picture import with_inputs
-from bench.demo_rgb import rgb_part
+from bench.demo.bag import stamp_ns_of, write_bag
+from bench.demo.picture import with_inputs
+from bench.demo.rgb import rgb_part
 from bench.rooms import RoomPair, make_pair
 from bench.stereo import StereoPair, depth_of_both, load_pairs
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
@@ -41,7 +41,7 @@ from garps_core.mixtures import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:
-    from bench.demo_live import LivePose  # needs rclpy
+    from bench.demo.live import LivePose  # needs rclpy
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""
@@ -233,8 +233,8 @@ def live_part(out: Path, scenes: int) -> bool:
     """The stereo pairs played into the node; whether its poses are good, and true where there is no rclpy."""
     console.rule("Live: the same pairs over ROS 2, into pose_node")
     try:
-        from bench.demo_live import run_live
-        from bench.live_graph import LiveError
+        from bench.demo.live import run_live
+        from bench.live.graph import LiveError
     except ImportError as error:
         console.print(f"skipped: {error} (ROS 2 is not installed; its wheels are for x86_64 only)", soft_wrap=True)
         return True

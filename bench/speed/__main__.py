@@ -19,13 +19,13 @@ from rich.console import Console
 
 from bench import registration
 from bench.datasets import DATA, Pair, available, load_pairs, scene_points
-from bench.speed_determinism import determinism_section
-from bench.speed_growth import growth_section
-from bench.speed_memory import memory_section
-from bench.speed_pairs import pairs_section
-from bench.speed_parts import Inputs, Row, Section, imported_numba, markdown, print_section
-from bench.speed_solver import autograd_section, paper_section
-from bench.speed_stream import stream_section
+from bench.speed.determinism import determinism_section
+from bench.speed.growth import growth_section
+from bench.speed.memory import memory_section
+from bench.speed.pairs import pairs_section
+from bench.speed.parts import Inputs, Row, Section, imported_numba, markdown, print_section
+from bench.speed.solver import autograd_section, paper_section
+from bench.speed.stream import stream_section
 from bench.tables import machine_facts
 from garps_core import View
 

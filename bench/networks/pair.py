@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from bench.rooms import RoomPair, make_pair
-from bench.speed_parts import Row
+from bench.speed.parts import Row
 from garps_core import Config, PoseEstimate, View, estimate_relative_pose
 from garps_core.models import in_use
 from garps_core.models.depth_anything import DepthAnythingV2

@@ -30,7 +30,7 @@ from rich.progress import Progress
 from rich.table import Table
 from sensor_msgs.msg import CameraInfo, Image
 
-from bench.live_graph import Listener, LiveError, end, listener, private_domain, start
+from bench.live.graph import Listener, LiveError, end, listener, private_domain, start
 from bench.rooms import RoomPair, make_pair
 from msg_adapters import ns_to_stamp, stamp_to_ns
 

@@ -6,7 +6,7 @@
 Each network runs as GARPS calls it, from images, with random weights (the cost does not depend on them), float32, in a
 fresh process. Every timed call stands between multiplications of large matrices, so that whatever else the machine does
 hits both; numbers are medians. The share by CPU time also bears a machine whose cores are taken by others. A second
-table shows where the time of a whole pair goes (`bench/networks_pair.py`).
+table shows where the time of a whole pair goes (`bench/networks/pair.py`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ import typer
 from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from bench.networks_pair import pair_lines, peak_mib, seconds_of
-from bench.speed_parts import Check, Row, Section, markdown, print_section
+from bench.networks.pair import pair_lines, peak_mib, seconds_of
+from bench.speed.parts import Check, Row, Section, markdown, print_section
 from bench.tables import machine_facts
 
 Call = Callable[[], Any]

@@ -11,8 +11,8 @@ from typing import TypeVar
 import numpy as np
 from rich.progress import track
 
-from bench.speed_fresh import STEPS, all_used
-from bench.speed_parts import Check, Inputs, Row, Section, lifted, threads
+from bench.speed.fresh import STEPS, all_used
+from bench.speed.parts import Check, Inputs, Row, Section, lifted, threads
 from garps_core import Mixture, align_mixtures
 from garps_core.config import Rung
 from garps_core.objective.pairs import pair_up, to_cloud

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.autograd import PlainObjective
-from bench.speed_parts import Check, Inputs, Row, Section, interleaved, medians, threads
+from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A fresh process that estimates one pair, or aligns two mixtures, and prints its peak memory and a digest as JSON.
 
-    python -m bench.speed_fresh estimate|align FILE.npz PRESET
+    python -m bench.speed.fresh estimate|align FILE.npz PRESET
 
 It imports what the task needs and nothing else, for its memory counts.
 """
@@ -73,7 +73,7 @@ def in_fresh_process(task: str, arrays: dict[str, Any], preset: str) -> dict[str
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "input.npz"
         np.savez(path, **arrays)
-        command = [sys.executable, "-m", "bench.speed_fresh", task, str(path), preset]
+        command = [sys.executable, "-m", "bench.speed.fresh", task, str(path), preset]
         done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     if done.returncode != 0:
         raise RuntimeError(f"the fresh process failed: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 
-from bench.live_graph import Listener, LiveError, end, listener, private_domain, start
+from bench.live.graph import Listener, LiveError, end, listener, private_domain, start
 from msg_adapters import pose_from_message, stamp_to_ns
 
 POSE_TOPIC = "/pose_node/pose"
@@ -41,7 +41,7 @@ def run_live(bag: Path, log: Path) -> tuple[dict[int, LivePose], int]:
     """Play a bag into a fresh node, as fast as it was recorded.
 
     Args:
-        bag: with the topics of `bench.demo_bag`; the node drops pairs that it has no time for.
+        bag: with the topics of `bench.demo.bag`; the node drops pairs that it has no time for.
         log: takes what the node and the playback write.
     Returns:
         source stamp (ns) -> pose, and the exit code of the node after SIGINT.
