@@ -14,9 +14,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench.bare import SET as BARE_ROOMS
 from bench.intervals import Difference, paired_difference
-from bench.learned_rooms import SET as LEARNED_ROOMS
+from bench.pairs.bare import SET as BARE_ROOMS
+from bench.pairs.learned_rooms import SET as LEARNED_ROOMS
 from bench.tables import GARPS, START, Row, coverage, quality_auc, summarise
 
 REGISTRATION = ("open3d-gicp", "open3d-colored", "open3d-plane", "small-gicp", "rgbd-hybrid", "rgbd-intensity")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.datasets import Pair
+from bench.pairs.datasets import Pair
 from bench.tables import Row
 from garps_core.types import View
 

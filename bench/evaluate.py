@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.baselines import METHODS
-from bench.datasets import Pair, disturbed_prior, truth_covariance
+from bench.pairs.datasets import Pair, disturbed_prior, truth_covariance
 from bench.scores import camera_error_m, vcre_px
 from bench.tables import ERRORS, START, Row
 from bench.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate

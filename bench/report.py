@@ -11,11 +11,11 @@ from rich.console import Console
 
 from bench import acceptance
 from bench.ablations import ablation_tables
-from bench.datasets import Pair
 from bench.depth_errors import depth_tables
+from bench.pairs.datasets import Pair
+from bench.pairs.sources import with_depth_of
 from bench.paper_tables import paper_tables
 from bench.plots import write_plots
-from bench.sources import with_depth_of
 from bench.statistics_blocks import pair_of
 from bench.tables import GARPS, START, Row, print_tables, write
 from garps_core import Config

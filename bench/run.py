@@ -27,13 +27,11 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bench.baselines import METHODS, NEED_NO_START
-from bench.datasets import HALVES, Pair, disturbed_prior
 from bench.depth_errors import errors_of_pair
 from bench.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
 from bench.jobs import computed
-from bench.report import write_report
-from bench.runs import Key, RowLog, reusable_rows, reuse_note
-from bench.sources import (
+from bench.pairs.datasets import HALVES, Pair, disturbed_prior
+from bench.pairs.sources import (
     DEPTHS,
     NAMES,
     SENSOR,
@@ -48,6 +46,8 @@ from bench.sources import (
     with_depth_of,
     without_depth,
 )
+from bench.report import write_report
+from bench.runs import Key, RowLog, reusable_rows, reuse_note
 from bench.tables import Row, machine_facts
 from bench.variants import GARPS, GARPS_NO_FEATURES, GARPS_PAPER, VARIANTS
 from garps_core import Config, GarpsError

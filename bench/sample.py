@@ -5,7 +5,7 @@
     python -m bench.sample FOLDER --depth depth_anything_v2              # in that network's metres
     python -m bench.sample FOLDER --split validation --scale sfm-depth   # in the metres of depth maps that are there
 
-The layout of the folder is in `bench/readers/realestate10k.py`. With --depth the network first makes the depth maps of
+The layout of the folder is in `bench/pairs/readers/realestate10k.py`. With --depth the network first makes the depth maps of
 frame 0 that are missing, for every clip whose frame is there; a run that was stopped goes on. The metres so found are
 that network's: they say nothing about how right it is.
 """
@@ -21,11 +21,11 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.readers import realestate10k as re10k
-from bench.readers.files import image
-from bench.readers.pair_list import RAW
-from bench.readers.sfm_scale import SOURCE
-from bench.sources import DEPTHS, MONOCULAR, SENSOR
+from bench.pairs.readers import realestate10k as re10k
+from bench.pairs.readers.files import image
+from bench.pairs.readers.pair_list import RAW
+from bench.pairs.readers.sfm_scale import SOURCE
+from bench.pairs.sources import DEPTHS, MONOCULAR, SENSOR
 from garps_core import Config, GarpsError, View
 from garps_core.mixtures.reconstruct import with_depth
 

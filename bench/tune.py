@@ -33,9 +33,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from bench.datasets import Pair
 from bench.evaluate import evaluate
-from bench.sources import (
+from bench.pairs.datasets import Pair
+from bench.pairs.sources import (
     BARE,
     DEMO_NET,
     MONOCULAR,

@@ -258,7 +258,7 @@ def test_cuda_that_is_not_there_is_named():
 
 def lounge_pairs():
     """Three pairs of a recorded RGB-D camera; skipped where the recordings are not."""
-    datasets = pytest.importorskip("bench.datasets")
+    datasets = pytest.importorskip("bench.pairs.datasets")
     if "hololens_lounge" not in datasets.available(DATA):
         pytest.skip(f"no recorded pairs in {DATA}/dev/hololens_lounge")
     return datasets.load_pairs("hololens_lounge", DATA, limit=3)
@@ -274,7 +274,7 @@ def test_recorded_pairs_from_features():
 
 
 def test_recorded_pairs_from_a_disturbed_truth():
-    datasets = pytest.importorskip("bench.datasets")
+    datasets = pytest.importorskip("bench.pairs.datasets")
     for pair in lounge_pairs():
         prior = datasets.disturbed_prior(pair)
         start = translation_error_m(prior.T_target_source, pair.T_target_source)

@@ -6,9 +6,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bench import datasets, tables
+from bench import tables
 from bench.baselines import METHODS, NEED_NO_START
 from bench.odometry import with_intrinsics
+from bench.pairs import datasets
 from bench.pnp import features_pnp
 from bench.registration import FAST_LEVELS, cloud, without_edges
 from garps_core import View, metrics

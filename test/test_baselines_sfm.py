@@ -17,8 +17,8 @@ from test_baselines import ON_THE_WALL, method
 from bench import metres
 from bench.baselines import METHODS, NEED_NO_START, NONDETERMINISTIC
 from bench.colmap import colmap_relaxed
-from bench.datasets import Pair, disturbed, rng_of, scene_points
 from bench.five_point import five_point
+from bench.pairs.datasets import Pair, disturbed, rng_of, scene_points
 from bench.pnp import Failure, features_pnp_oneway
 from bench.rooms import make_pair
 from garps_core import View, metrics

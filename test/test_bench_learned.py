@@ -9,10 +9,10 @@ import pytest
 pytest.importorskip("embreex")
 
 from bench.acceptance import Bar, bars, differences
-from bench.datasets import Pair
 from bench.depth_data import FIRST_SEED
 from bench.depth_errors import depth_errors, depth_tables, errors_of_pair
-from bench.learned_rooms import KINDS, SPLITS, kind_of, level_of
+from bench.pairs.datasets import Pair
+from bench.pairs.learned_rooms import KINDS, SPLITS, kind_of, level_of
 from bench.rooms import LEVELS
 from bench.train_depth import HELD_OUT_SEED
 from garps_core import View

@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from bench import acceptance, evaluate, runs, sources, tables
+from bench import acceptance, evaluate, runs, tables
 from bench.baselines import METHODS
+from bench.pairs import sources
 
 INF = float("inf")
 
@@ -170,7 +171,7 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
 def test_known_rows_of_peers_are_taken_over():
     from test_bench_bare import HEIGHT, WIDTH
 
-    from bench import bare
+    from bench.pairs import bare
     from garps_core import Config
 
     pair = bare.room_pair(22, 1, WIDTH, HEIGHT)

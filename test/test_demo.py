@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 
 from bench.demo import __main__ as demo
 from bench.demo.bag import stamp_ns_of, write_bag
-from bench.stereo import StereoPair, depth_of_both
+from bench.pairs.stereo import StereoPair, depth_of_both
 from msg_adapters import depth_image, rgb_image
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])

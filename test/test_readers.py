@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.datasets import rng_of
-from bench.readers import READERS, MissingFiles, load, pair_list, realestate10k, sfm_scale
-from bench.readers.files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
+from bench.pairs.datasets import rng_of
+from bench.pairs.readers import pair_list, realestate10k, sfm_scale
+from bench.pairs.readers.files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
+from bench.readers import READERS, MissingFiles, load
 from garps_core.geometry import project, se3_inverse, transform
 
 WIDTH, HEIGHT = 64, 36
@@ -343,7 +344,7 @@ def test_inputs_are_bounded(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no UTF-8 text"):
         text_of(path)
     np.savez_compressed(tmp_path / "bomb.npz", points=np.zeros(10_000))
-    monkeypatch.setattr("bench.readers.files.MAX_BYTES", 2000)
+    monkeypatch.setattr("bench.pairs.readers.files.MAX_BYTES", 2000)
     with pytest.raises(ValueError, match="unpacked"):
         arrays(tmp_path / "bomb.npz")
     path.write_bytes(b"1" * 2001)

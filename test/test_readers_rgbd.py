@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.readers import MissingFiles, load, mapfree, scannet1500, seven_scenes, tum
+from bench.pairs.readers import mapfree, scannet1500, seven_scenes, tum
+from bench.readers import MissingFiles, load
 from garps_core.geometry import project, se3_inverse, transform
 
 WIDTH, HEIGHT = 640, 480

@@ -10,7 +10,7 @@ import typer
 from surfaces import TRUTH, look, random_pose
 
 from bench.autograd import PlainObjective
-from bench.datasets import Pair, scene_points
+from bench.pairs.datasets import Pair, scene_points
 from bench.speed import __main__ as speed
 from bench.speed import fresh
 from bench.speed.determinism import determinism_section

@@ -33,8 +33,8 @@ from scipy.spatial.transform import Rotation
 from bench.demo.bag import stamp_ns_of, write_bag
 from bench.demo.picture import with_inputs
 from bench.demo.rgb import rgb_part
+from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
 from bench.rooms import RoomPair, make_pair
-from bench.stereo import StereoPair, depth_of_both, load_pairs
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
 from garps_core.cli.figure import before_after
 from garps_core.mixtures import reconstruct

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bench.stereo import StereoPair
+from bench.pairs.stereo import StereoPair
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 FIRST_STAMP_S = 1_700_000_000

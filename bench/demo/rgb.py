@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from bench.datasets import scene_points
 from bench.demo.picture import with_inputs
 from bench.depth_errors import depth_errors
+from bench.pairs.datasets import scene_points
 from bench.rooms import RoomPair, make_pair
 from garps_core import View, metrics
 from garps_core.checks import Float64Array

@@ -25,7 +25,7 @@ from garps_core import Config, Mixture, PoseEstimate, Prior, View, align_mixture
 from garps_core.mixture import Frustum
 
 if TYPE_CHECKING:
-    from bench.datasets import Pair
+    from bench.pairs.datasets import Pair
 
 Task = Callable[[], PoseEstimate]
 PARTS = ("means", "covariances", "weights", "colours")

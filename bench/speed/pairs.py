@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.baselines import METHODS
-from bench.datasets import Pair, disturbed_prior
+from bench.pairs.datasets import Pair, disturbed_prior
 from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians
 from garps_core import Config, PoseEstimate, Prior, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from bench.datasets import Pair, disturbed_prior
+from bench.pairs.datasets import Pair, disturbed_prior
 from garps_core import Config, Mixture, Prior
 from garps_core.mixtures import reconstruct
 

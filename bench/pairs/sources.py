@@ -11,10 +11,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench import bare, learned_rooms
-from bench.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread, with_monocular_depth
+from bench.pairs import bare, learned_rooms
+from bench.pairs.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread, with_monocular_depth
+from bench.pairs.readers.pair_list import RAW
 from bench.readers import READERS, load
-from bench.readers.pair_list import RAW
 from garps_core import Config, GarpsError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models.in_use import depth_network_of

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.datasets import Pair
-from bench.readers import mapfree, pair_list, realestate10k, scannet1500, seven_scenes, tum
-from bench.readers.files import MissingFiles
+from bench.pairs.datasets import Pair
+from bench.pairs.readers import mapfree, pair_list, realestate10k, scannet1500, seven_scenes, tum
+from bench.pairs.readers.files import MissingFiles
 
 __all__ = ["READERS", "MissingFiles", "load"]
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pairs of generated rooms that the demonstration network has not seen, rich in texture to hardly anything to match.
 
-    python -m bench.learned_rooms
+    python -m bench.pairs.learned_rooms
 
 Seeds are not those of the rooms to learn from (`bench.depth_data`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
-35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.sources.with_depth_of` puts a network's in its
+35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.sources.with_depth_of` puts a network's in its
 place.
 """
 
@@ -20,16 +20,16 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.bare import in_the_dark, matches
-from bench.datasets import Pair, scene_points
 from bench.jobs import computed
+from bench.pairs.bare import in_the_dark, matches
+from bench.pairs.datasets import Pair, scene_points
 from bench.rooms import LEVELS, make_pair
 from garps_core import View
 
 SET = "learned_rooms"
 FOLDER = Path("out/learned_rooms")
 KINDS = {"rich": 1.0, "medium": 0.4, "plain": 0.0, "dark": 0.0}
-"""Texture of each; dark is plain, in dim light from a moving camera (`bench.bare.in_the_dark`)."""
+"""Texture of each; dark is plain, in dim light from a moving camera (`bench.pairs.bare.in_the_dark`)."""
 SPLITS = {"tune": range(91_000, 91_060), "report": range(92_000, 92_200)}
 VERSION = 1
 

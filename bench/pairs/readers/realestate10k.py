@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.datasets import Pair, rng_of
-from bench.readers import pair_list
-from bench.readers.files import (
+from bench.pairs.datasets import Pair, rng_of
+from bench.pairs.readers import pair_list
+from bench.pairs.readers.files import (
     MissingFiles,
     category_of,
     depth_map,
@@ -35,8 +35,8 @@ from bench.readers.files import (
     rows,
     text_of,
 )
-from bench.readers.pair_list import RAW, Record
-from bench.readers.sfm_scale import SOURCE, depth_scale, points_file, read_points
+from bench.pairs.readers.pair_list import RAW, Record
+from bench.pairs.readers.sfm_scale import SOURCE, depth_scale, points_file, read_points
 from garps_core.checks import Float64Array
 from garps_core.geometry import se3_inverse, transform
 

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.datasets import Pair, rng_of
-from bench.readers.files import (
+from bench.pairs.datasets import Pair, rng_of
+from bench.pairs.readers.files import (
     Candidate,
     chosen,
     depth_map,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generated pairs with hardly anything to match: plain rooms in the dark, seen by a robot that moves.
 
-    python -m bench.bare --out out/bare_rooms
+    python -m bench.pairs.bare --out out/bare_rooms
 
 A room of texture 0 (`bench.rooms`) still has lamps, edges and shadows. What a camera on a moving robot makes of them in
 a dim room is simulated from linear light on: less light, motion blur along one direction, shot and read noise
@@ -23,7 +23,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.datasets import Pair, scene_points
+from bench.pairs.datasets import Pair, scene_points
 from bench.rooms import RoomPair, make_pair
 from garps_core import Config, View
 from garps_core.start.features import match_features

@@ -17,8 +17,8 @@ import functools
 import re
 from pathlib import Path
 
-from bench.datasets import Pair, rng_of
-from bench.readers.files import (
+from bench.pairs.datasets import Pair, rng_of
+from bench.pairs.readers.files import (
     Candidate,
     chosen,
     depth_map,

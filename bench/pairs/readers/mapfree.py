@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.datasets import Pair
-from bench.readers.files import (
+from bench.pairs.datasets import Pair
+from bench.pairs.readers.files import (
     Candidate,
     floats,
     gathered,

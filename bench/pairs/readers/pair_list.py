@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.datasets import Pair
-from bench.readers.files import Candidate, category_of, gathered, image, inside, pair_of, require, text_of, view
+from bench.pairs.datasets import Pair
+from bench.pairs.readers.files import Candidate, category_of, gathered, image, inside, pair_of, require, text_of, view
 from garps_core.checks import Float64Array, checked_intrinsics, checked_rigid
 from garps_core.types import View
 
