@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.baselines import METHODS
 from bench.pairs.datasets import Pair, disturbed_prior, truth_covariance
+from bench.peers.baselines import METHODS
 from bench.scores import camera_error_m, vcre_px
 from bench.tables import ERRORS, START, Row
 from bench.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
@@ -36,7 +36,7 @@ def evaluate(
         config: settings of GARPS; its `start.method` is set here.
         pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
         start: one of `STARTS`.
-        methods: names from `bench.variants.VARIANTS` and `bench.baselines.METHODS`. GARPS always runs where the start
+        methods: names from `bench.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where the start
             comes from it.
         seed: of the disturbance.
     Returns: rows, per pair first "(start)", then the methods in order.

@@ -44,7 +44,7 @@ TIME = (
 )
 """What is inside the seconds of rows that `bench.evaluate` made."""
 LENGTH_FROM_DEPTH = ("five-point", "colmap", "colmap-relaxed")
-"""Methods that find a direction, and take the length of t from the depth of the pair (`bench.metres`)."""
+"""Methods that find a direction, and take the length of t from the depth of the pair (`bench.peers.metres`)."""
 COUNTS = ("n poses", "Failures")
 LENGTHS = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, INF)
 COMMON_SHARE = 0.5

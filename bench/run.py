@@ -26,7 +26,6 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.baselines import METHODS, NEED_NO_START
 from bench.depth_errors import errors_of_pair
 from bench.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
 from bench.jobs import computed
@@ -46,6 +45,7 @@ from bench.pairs.sources import (
     with_depth_of,
     without_depth,
 )
+from bench.peers.baselines import METHODS, NEED_NO_START
 from bench.report import write_report
 from bench.runs import Key, RowLog, reusable_rows, reuse_note
 from bench.tables import Row, machine_facts

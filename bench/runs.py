@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.baselines import METHODS, NEED_NO_START
+from bench.peers.baselines import METHODS, NEED_NO_START
 from bench.tables import ERRORS, Row
 
 ROWS, PREVIOUS = "rows.jsonl", "rows.previous.jsonl"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bench import tables
-from bench.baselines import METHODS, NEED_NO_START
-from bench.odometry import with_intrinsics
 from bench.pairs import datasets
-from bench.pnp import features_pnp
-from bench.registration import FAST_LEVELS, cloud, without_edges
+from bench.peers.baselines import METHODS, NEED_NO_START
+from bench.peers.features_pnp import features_pnp
+from bench.peers.odometry import with_intrinsics
+from bench.peers.registration import FAST_LEVELS, cloud, without_edges
 from garps_core import View, metrics
 from garps_core.geometry import project, se3_exp, transform
 

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from bench.baselines import METHODS
 from bench.pairs import bare, datasets
 from bench.pairs.bare import LEVELS, SPLITS, Split
+from bench.peers.baselines import METHODS
 from garps_core import metrics
 
 WIDTH, HEIGHT = 160, 120

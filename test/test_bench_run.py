@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 pytest.importorskip("embreex")
 
 from bench import repeat, run
-from bench.baselines import METHODS
 from bench.pairs import sources
 from bench.pairs.datasets import read_pairs
+from bench.peers.baselines import METHODS
 from bench.rooms import make_pair
 from garps_core import Config, View
 

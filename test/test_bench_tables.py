@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bench import acceptance, evaluate, runs, tables
-from bench.baselines import METHODS
 from bench.pairs import sources
+from bench.peers.baselines import METHODS
 
 INF = float("inf")
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The preset "paper" is the published method: its numbers, its objective and every step of its optimiser.
 
-The reference, `bench.autograd`, is written from the paper's eq. 5 with automatic differentiation and torch's Adam, its
+The reference, `bench.peers.autograd`, is written from the paper's eq. 5 with automatic differentiation and torch's Adam, its
 candidate pairs here from section 3.2; it shares no code with the package.
 """
 
@@ -12,7 +12,7 @@ import pytest
 import torch
 from surfaces import FREE, random_pose
 
-from bench.autograd import PlainObjective, rotation
+from bench.peers.autograd import PlainObjective, rotation
 from garps_core import Config, Mixture, Prior, Status, align_mixtures
 from garps_core.geometry import se3_inverse, transform
 from garps_core.objective.pairs import to_cloud

@@ -9,8 +9,8 @@ import torch
 import typer
 from surfaces import TRUTH, look, random_pose
 
-from bench.autograd import PlainObjective
 from bench.pairs.datasets import Pair, scene_points
+from bench.peers.autograd import PlainObjective
 from bench.speed import __main__ as speed
 from bench.speed import fresh
 from bench.speed.determinism import determinism_section

@@ -17,8 +17,8 @@ import torch
 import typer
 from rich.console import Console
 
-from bench import registration
 from bench.pairs.datasets import DATA, Pair, available, load_pairs, scene_points
+from bench.peers import registration
 from bench.speed.determinism import determinism_section
 from bench.speed.growth import growth_section
 from bench.speed.memory import memory_section

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.baselines import METHODS
 from bench.pairs.datasets import Pair, disturbed_prior
+from bench.peers.baselines import METHODS
 from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians
 from garps_core import Config, PoseEstimate, Prior, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bench.autograd import PlainObjective
+from bench.peers.autograd import PlainObjective
 from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array

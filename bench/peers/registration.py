@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.pnp import Failure, features_pnp
+from bench.peers.features_pnp import Failure, features_pnp
 from garps_core.checks import Float64Array
 from garps_core.geometry import pixel_rays
 from garps_core.types import View

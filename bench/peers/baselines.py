@@ -17,13 +17,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from bench import registration
-from bench.colmap import colmap, colmap_relaxed
-from bench.cpd import cpd
-from bench.five_point import five_point
-from bench.network_pose import dust3r, mast3r
-from bench.odometry import rgbd_hybrid, rgbd_intensity
-from bench.pnp import Failure, features_pnp, features_pnp_oneway
+from bench.peers import registration
+from bench.peers.colmap import colmap, colmap_relaxed
+from bench.peers.cpd import cpd
+from bench.peers.features_pnp import Failure, features_pnp, features_pnp_oneway
+from bench.peers.five_point import five_point
+from bench.peers.odometry import rgbd_hybrid, rgbd_intensity
+from bench.peers.two_view_networks import dust3r, mast3r
 from garps_core import GarpsError
 from garps_core.checks import Float64Array
 from garps_core.types import View

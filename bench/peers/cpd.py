@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.registration import cloud, open3d
+from bench.peers.registration import cloud, open3d
 from garps_core.checks import Float64Array
 from garps_core.geometry import transform
 from garps_core.types import View

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.metres import Triangulated, with_length
-from bench.pnp import MIN_INLIERS, Failure, camera, matches
+from bench.peers.features_pnp import MIN_INLIERS, Failure, camera, matches
+from bench.peers.metres import Triangulated, with_length
 from garps_core.checks import Float64Array
 from garps_core.geometry import pixel_rays
 from garps_core.types import View
@@ -16,7 +16,7 @@ EPIPOLAR_PX = 1.0
 
 
 def five_point(source: View, target: View) -> Float64Array:
-    """RootSIFT, PoseLib's five points and bundle adjustment; the length of t from depth (`bench.metres`).
+    """RootSIFT, PoseLib's five points and bundle adjustment; the length of t from depth (`bench.peers.metres`).
 
     Raises:
         Failure: too few matches, inliers, or inliers with depth.

@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.pnp import Failure
-from bench.registration import open3d
+from bench.peers.features_pnp import Failure
+from bench.peers.registration import open3d
 from garps_core.checks import Float64Array
 from garps_core.types import View
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from bench.pnp import Failure
+from bench.peers.features_pnp import Failure
 from garps_core import Config
 from garps_core.checks import Float64Array
 from garps_core.errors import WeightsError

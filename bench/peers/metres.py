@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.pnp import MIN_INLIERS, Failure, trusted_depth
+from bench.peers.features_pnp import MIN_INLIERS, Failure, trusted_depth
 from garps_core.checks import Float64Array
 from garps_core.types import View
 

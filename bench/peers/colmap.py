@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.metres import Triangulated, with_length
-from bench.pnp import Failure
+from bench.peers.features_pnp import Failure
+from bench.peers.metres import Triangulated, with_length
 from garps_core.checks import Float64Array
 from garps_core.types import View
 
@@ -34,7 +34,7 @@ CENTRE = 0.5
 
 
 def colmap(source: View, target: View) -> Float64Array:
-    """Incremental mapping of COLMAP with its defaults; the length of t from depth (`bench.metres`)."""
+    """Incremental mapping of COLMAP with its defaults; the length of t from depth (`bench.peers.metres`)."""
     return _mapped(source, target, {})
 
 
