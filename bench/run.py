@@ -26,9 +26,6 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.depth_errors import errors_of_pair
-from bench.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
-from bench.jobs import computed
 from bench.pairs.datasets import HALVES, Pair, disturbed_prior
 from bench.pairs.sources import (
     DEPTHS,
@@ -46,10 +43,13 @@ from bench.pairs.sources import (
     without_depth,
 )
 from bench.peers.baselines import METHODS, NEED_NO_START
-from bench.report import write_report
-from bench.runs import Key, RowLog, reusable_rows, reuse_note
-from bench.tables import Row, machine_facts
-from bench.variants import GARPS, GARPS_NO_FEATURES, GARPS_PAPER, VARIANTS
+from bench.report.write import write_report
+from bench.rows.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
+from bench.rows.jobs import computed
+from bench.rows.row_log import Key, RowLog, reusable_rows, reuse_note
+from bench.rows.variants import GARPS, GARPS_NO_FEATURES, GARPS_PAPER, VARIANTS
+from bench.scoring.depth_errors import errors_of_pair
+from bench.scoring.tables import Row, machine_facts
 from garps_core import Config, GarpsError
 from garps_core.config.text import changed_config, read_settings
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the demonstration depth network (`garps_core/models/demo_net.py`) on generated rooms, on a CPU.
 
-    python -m bench.depth_data                 # the rooms, once
+    python -m bench.training.rooms                 # the rooms, once
     python -m bench.train_depth                # goes on where it was stopped
     python -m bench.train_depth --steps 200    # a try
 
@@ -28,10 +28,10 @@ from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bench.depth_data import FIRST_SEED, FOLDER, render
-from bench.depth_errors import DepthErrors, depth_errors
-from bench.depth_pictures import BATCH, Pictures, batches
-from bench.tables import machine_facts
+from bench.scoring.depth_errors import DepthErrors, depth_errors
+from bench.scoring.tables import machine_facts
+from bench.training.pictures import BATCH, Pictures, batches
+from bench.training.rooms import FIRST_SEED, FOLDER, render
 from garps_core.models.demo_net import FILE, WHAT_IT_IS, DemoNet, Unit
 from garps_core.weights.reader import write_tensors
 

@@ -33,7 +33,6 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from bench.evaluate import evaluate
 from bench.pairs.datasets import Pair
 from bench.pairs.sources import (
     BARE,
@@ -50,7 +49,8 @@ from bench.pairs.sources import (
     usable,
     with_depth_of,
 )
-from bench.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
+from bench.rows.evaluate import evaluate
+from bench.scoring.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
 from garps_core import Config, GarpsError
 from garps_core.config.text import write_settings
 from garps_core.metrics import CHI2_6_95

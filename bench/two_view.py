@@ -22,8 +22,8 @@ from rich.console import Console
 
 from bench.networks.__main__ import counted_flop
 from bench.networks.pair import peak_mib, seconds_of
+from bench.scoring.tables import machine_facts
 from bench.speed.parts import Check, Row, Section, markdown
-from bench.tables import machine_facts
 from garps_core.models.mast3r import NaverModel, prepared
 from garps_core.models.two_view import Architecture, Stack, TwoView
 

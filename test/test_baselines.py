@@ -6,12 +6,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bench import tables
 from bench.pairs import datasets
 from bench.peers.baselines import METHODS, NEED_NO_START
 from bench.peers.features_pnp import features_pnp
 from bench.peers.odometry import with_intrinsics
 from bench.peers.registration import FAST_LEVELS, cloud, without_edges
+from bench.scoring import tables
 from garps_core import View, metrics
 from garps_core.geometry import project, se3_exp, transform
 

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from bench.ablations import ablation_tables
-from bench.intervals import paired_difference, relative_change
+from bench.report.ablations import ablation_tables
+from bench.scoring.intervals import paired_difference, relative_change
 
 
 def test_no_difference_is_zero_and_seeded() -> None:

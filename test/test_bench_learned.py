@@ -8,13 +8,13 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from bench.acceptance import Bar, bars, differences
-from bench.depth_data import FIRST_SEED
-from bench.depth_errors import depth_errors, depth_tables, errors_of_pair
 from bench.pairs.datasets import Pair
 from bench.pairs.learned_rooms import KINDS, SPLITS, kind_of, level_of
+from bench.report.acceptance import Bar, bars, differences
 from bench.rooms import LEVELS
+from bench.scoring.depth_errors import depth_errors, depth_tables, errors_of_pair
 from bench.train_depth import HELD_OUT_SEED
+from bench.training.rooms import FIRST_SEED
 from garps_core import View
 
 PLACE = {"depth": "demo_net", "set": "learned_rooms", "category": "rich", "seconds": 0.1, "reason": ""}

@@ -6,9 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from bench import acceptance, evaluate, runs, tables
 from bench.pairs import sources
 from bench.peers.baselines import METHODS
+from bench.report import acceptance
+from bench.rows import evaluate, row_log
+from bench.scoring import tables
 
 INF = float("inf")
 
@@ -121,30 +123,30 @@ def test_acceptance_needs_all_rows():
 
 def test_resume_goes_on_and_refuses_other_settings(tmp_path):
     options = {"seed": 0, "settings": {"sensor": {"start.method": "auto"}}}
-    log = runs.RowLog(tmp_path, options)
+    log = row_log.RowLog(tmp_path, options)
     log.add([made_row("garps", INF), made_row("(start)", 0.1)])
     log.add([made_row("garps", pair="b")])
     with log.path.open("a") as file:
         file.write('[{"depth": "sen')  # torn
-    again = runs.RowLog(tmp_path, options, resume=True)
+    again = row_log.RowLog(tmp_path, options, resume=True)
     assert again.rows == log.rows
     assert again.done == {("sensor", "hololens_lounge", "disturbed", pair) for pair in "ab"}
     again.add([made_row("garps", pair="c")])
-    assert len(runs.RowLog(tmp_path, options, resume=True).rows) == 4
+    assert len(row_log.RowLog(tmp_path, options, resume=True).rows) == 4
     other = {"seed": 1, "settings": {"sensor": {"start.method": "identity"}}}
     with pytest.raises(ValueError, match=r"seed was 0, is 1; settings.sensor.start.method was 'auto', is 'identity'"):
-        runs.RowLog(tmp_path, other, resume=True)
-    assert runs.RowLog(tmp_path, options, resume=True).rows
-    assert runs.RowLog(tmp_path, options).rows == []
+        row_log.RowLog(tmp_path, other, resume=True)
+    assert row_log.RowLog(tmp_path, options, resume=True).rows
+    assert row_log.RowLog(tmp_path, options).rows == []
     with pytest.raises(ValueError, match="nothing to resume"):
-        runs.RowLog(tmp_path / "new", options, resume=True)
+        row_log.RowLog(tmp_path / "new", options, resume=True)
 
 
 def test_damage_within_the_rows_is_told(tmp_path):
-    log = runs.RowLog(tmp_path, {})
+    log = row_log.RowLog(tmp_path, {})
     log.path.write_text("{}\n[{\n[]\n")
     with pytest.raises(ValueError, match="damaged in line 2"):
-        runs.RowLog(tmp_path, {}, resume=True)
+        row_log.RowLog(tmp_path, {}, resume=True)
 
 
 def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
@@ -153,19 +155,19 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
         made_row("open3d-gicp", start="features"), made_row("sift-pnp", start="features"),
     ]  # fmt: skip
     tables.write(tmp_path, rows, {"seed": 0, "commit": "abc"})
-    known = runs.reusable_rows(tmp_path / "run.json", 0)
+    known = row_log.reusable_rows(tmp_path / "run.json", 0)
     assert {key[2]: list(found) for key, found in known.items()} == {
         "disturbed": ["open3d-gicp"],
         "features": ["sift-pnp"],
     }
     assert known["sensor", "hololens_lounge", "disturbed", "a"]["open3d-gicp"] == {**rows[0], "reused": "abc"}
     with pytest.raises(ValueError, match="made with seed 0, not 1"):
-        runs.reusable_rows(tmp_path / "run.json", 1)
+        row_log.reusable_rows(tmp_path / "run.json", 1)
     (tmp_path / "old.json").write_text(json.dumps({"facts": {"seed": 0}, "rows": [{"method": "garps"}]}))
     with pytest.raises(ValueError, match="rows without depth"):
-        runs.reusable_rows(tmp_path / "old.json", 0)
+        row_log.reusable_rows(tmp_path / "old.json", 0)
     with pytest.raises(ValueError, match=r"no run\.json"):
-        runs.reusable_rows(tmp_path / "none.json", 0)
+        row_log.reusable_rows(tmp_path / "none.json", 0)
 
 
 def test_known_rows_of_peers_are_taken_over():

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from bench.depth_data import shots
-from bench.depth_pictures import batches
 from bench.rooms.shading import camera_rays
 from bench.train_depth import Training, folded, loss_of, rate_at
+from bench.training.pictures import batches
+from bench.training.rooms import shots
 from garps_core import View
 from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, depth_of
 
@@ -17,10 +17,10 @@ STEPS = 4
 
 
 class Few:
-    """Three pictures of one room, as `bench.depth_pictures.Pictures` holds those of many."""
+    """Three pictures of one room, as `bench.training.pictures.Pictures` holds those of many."""
 
     def __init__(self):
-        from bench.depth_pictures import Pictures
+        from bench.training.pictures import Pictures
 
         found = list(shots(100_007, 3))
         self.rgb = np.stack([shot.rgb for shot in found])

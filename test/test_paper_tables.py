@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from bench import paper_tables as tables
+from bench.report import paper_tables as tables
 
 INF, NAN = float("inf"), float("nan")
 Cells = dict[str, dict[str, str]]

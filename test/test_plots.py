@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from bench.plots import (
+from bench.report.plots import (
     NothingToDraw,
     error_against,
     error_cdfs,
@@ -18,7 +18,7 @@ from bench.plots import (
     quality_reliability,
     write_plots,
 )
-from bench.tables import ERRORS
+from bench.scoring.tables import ERRORS
 
 INF = float("inf")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.scores import (
+from bench.scoring.scores import (
     VCRE_PX,
     auc,
     camera_error_m,

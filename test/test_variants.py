@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from bench.evaluate import START, evaluate_pair
 from bench.pairs.datasets import Pair, disturbed_prior, scene_points
 from bench.rooms import make_pair
-from bench.variants import VARIANTS, estimate, isotropic, last_rung, without_frustum
+from bench.rows.evaluate import START, evaluate_pair
+from bench.rows.variants import VARIANTS, estimate, isotropic, last_rung, without_frustum
 from garps_core import Config, View, estimate_relative_pose
 from garps_core.mixtures import reconstruct
 

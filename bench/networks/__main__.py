@@ -26,8 +26,8 @@ from rich.console import Console
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from bench.networks.pair import pair_lines, peak_mib, seconds_of
+from bench.scoring.tables import machine_facts
 from bench.speed.parts import Check, Row, Section, markdown, print_section
-from bench.tables import machine_facts
 
 Call = Callable[[], Any]
 BAR_SHARE = 0.5

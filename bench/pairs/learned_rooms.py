@@ -3,7 +3,7 @@
 
     python -m bench.pairs.learned_rooms
 
-Seeds are not those of the rooms to learn from (`bench.depth_data`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
+Seeds are not those of the rooms to learn from (`bench.training.rooms`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
 35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.sources.with_depth_of` puts a network's in its
 place.
 """
@@ -20,10 +20,10 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.jobs import computed
 from bench.pairs.bare import in_the_dark, matches
 from bench.pairs.datasets import Pair, scene_points
 from bench.rooms import LEVELS, make_pair
+from bench.rows.jobs import computed
 from garps_core import View
 
 SET = "learned_rooms"

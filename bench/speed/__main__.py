@@ -19,6 +19,7 @@ from rich.console import Console
 
 from bench.pairs.datasets import DATA, Pair, available, load_pairs, scene_points
 from bench.peers import registration
+from bench.scoring.tables import machine_facts
 from bench.speed.determinism import determinism_section
 from bench.speed.growth import growth_section
 from bench.speed.memory import memory_section
@@ -26,7 +27,6 @@ from bench.speed.pairs import pairs_section
 from bench.speed.parts import Inputs, Row, Section, imported_numba, markdown, print_section
 from bench.speed.solver import autograd_section, paper_section
 from bench.speed.stream import stream_section
-from bench.tables import machine_facts
 from garps_core import View
 
 PEER_THREADS = 2

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.pairs.datasets import Pair
-from bench.tables import Row
+from bench.scoring.tables import Row
 from garps_core.types import View
 
 

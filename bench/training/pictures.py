@@ -16,7 +16,7 @@ import torch
 import typer
 from torch import Tensor
 
-from bench.depth_data import VERSION
+from bench.training.rooms import VERSION
 from garps_core.models.demo_net import HEIGHT, WIDTH, prepared
 
 BATCH = 16
@@ -45,7 +45,7 @@ class Pictures:
         paths = [path for seed in seeds if (path := folder / f"room{seed}_v{VERSION}.npz").is_file()]
         if not paths:
             raise typer.BadParameter(
-                f"no rooms of seeds {seeds} in {folder}: run python -m bench.depth_data --out {folder}"
+                f"no rooms of seeds {seeds} in {folder}: run python -m bench.training.rooms --out {folder}"
             )
         first = _arrays(paths[0])
         self.rgb, self.depth, self.K = (np.empty((len(paths), *one.shape), one.dtype) for one in first)

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bench import acceptance
-from bench.ablations import ablation_tables
-from bench.depth_errors import depth_tables
 from bench.pairs.datasets import Pair
 from bench.pairs.sources import with_depth_of
-from bench.paper_tables import paper_tables
-from bench.plots import write_plots
-from bench.statistics_blocks import pair_of
-from bench.tables import GARPS, START, Row, print_tables, write
+from bench.report import acceptance
+from bench.report.ablations import ablation_tables
+from bench.report.paper_tables import paper_tables
+from bench.report.plots import write_plots
+from bench.scoring.depth_errors import depth_tables
+from bench.scoring.statistics_blocks import pair_of
+from bench.scoring.tables import GARPS, START, Row, print_tables, write
 from garps_core import Config
 from garps_core.cli.figure import before_after
 from garps_core.mixtures import reconstruct

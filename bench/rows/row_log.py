@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.peers.baselines import METHODS, NEED_NO_START
-from bench.tables import ERRORS, Row
+from bench.scoring.tables import ERRORS, Row
 
 ROWS, PREVIOUS = "rows.jsonl", "rows.previous.jsonl"
 Key = tuple[str, str, str, str]

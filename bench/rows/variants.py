@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bench.pairs.datasets import Pair
-from bench.tables import GARPS
+from bench.scoring.tables import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
 from garps_core.align import best_of
 from garps_core.errors import GarpsError, InitialisationError

@@ -11,9 +11,9 @@ import numpy as np
 
 from bench.pairs.datasets import Pair, disturbed_prior, truth_covariance
 from bench.peers.baselines import METHODS
-from bench.scores import camera_error_m, vcre_px
-from bench.tables import ERRORS, START, Row
-from bench.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
+from bench.rows.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
+from bench.scoring.scores import camera_error_m, vcre_px
+from bench.scoring.tables import ERRORS, START, Row
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 from garps_core.start.initialise import identity
@@ -36,7 +36,7 @@ def evaluate(
         config: settings of GARPS; its `start.method` is set here.
         pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
         start: one of `STARTS`.
-        methods: names from `bench.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where the start
+        methods: names from `bench.rows.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where the start
             comes from it.
         seed: of the disturbance.
     Returns: rows, per pair first "(start)", then the methods in order.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures with true depth to train a depth network on: generated rooms, seen by any camera in any light.
 
-    python -m bench.depth_data --rooms 1000 --out out/depth_data
+    python -m bench.training.rooms --rooms 1000 --out out/depth_data
 
 Every room of `bench.rooms` is changed at random: colours of its surfaces, how rich they are, its lamps and windows.
 Cameras stand, hang and tilt as they please, wide or narrow, exposed well or badly. Everything follows from the seeds,
