@@ -5,9 +5,9 @@
     python -m bench.sample FOLDER --depth depth_anything_v2              # in that network's metres
     python -m bench.sample FOLDER --split validation --scale sfm-depth   # in the metres of depth maps that are there
 
-The layout of the folder is in `bench/pairs/readers/realestate10k.py`. With --depth the network first makes the depth maps of
-frame 0 that are missing, for every clip whose frame is there; a run that was stopped goes on. The metres so found are
-that network's: they say nothing about how right it is.
+The layout of the folder is in `bench/pairs/readers/realestate10k.py`. With --depth the network first makes the depth
+maps of frame 0 that are missing, for every clip whose frame is there; a run that was stopped goes on. The metres so
+found are that network's: they say nothing about how right it is.
 """
 
 from __future__ import annotations

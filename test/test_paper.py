@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The preset "paper" is the published method: its numbers, its objective and every step of its optimiser.
 
-The reference, `bench.peers.autograd`, is written from the paper's eq. 5 with automatic differentiation and torch's Adam, its
-candidate pairs here from section 3.2; it shares no code with the package.
+The reference, `bench.peers.autograd`, is written from the paper's eq. 5 with automatic differentiation and torch's
+Adam, its candidate pairs here from section 3.2; it shares no code with the package.
 """
 
 from dataclasses import replace

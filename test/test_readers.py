@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.pairs.datasets import rng_of
-from bench.pairs.readers import pair_list, realestate10k, sfm_scale
+from bench.pairs.readers import READERS, MissingFiles, load, pair_list, realestate10k, sfm_scale
 from bench.pairs.readers.files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
-from bench.readers import READERS, MissingFiles, load
 from garps_core.geometry import project, se3_inverse, transform
 
 WIDTH, HEIGHT = 64, 36

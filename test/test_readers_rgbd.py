@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.pairs.readers import mapfree, scannet1500, seven_scenes, tum
-from bench.readers import MissingFiles, load
+from bench.pairs.readers import MissingFiles, load, mapfree, scannet1500, seven_scenes, tum
 from garps_core.geometry import project, se3_inverse, transform
 
 WIDTH, HEIGHT = 640, 480

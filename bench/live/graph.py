@@ -19,7 +19,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-LARGE_IMAGES = Path(__file__).resolve().parent.parent / "config" / "fastdds_large_images.xml"
+LARGE_IMAGES = Path(__file__).resolve().parents[2] / "config" / "fastdds_large_images.xml"
 STOP_S = 10.0
 """Patience with a process that has been told to end."""
 

@@ -24,7 +24,7 @@ from garps_core.geometry import pixel_rays, skew, transform
 from garps_core.types import Prior, View
 
 Item = TypeVar("Item")
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 HALVES = ("all", "dev", "held-out")
 """Parameters are chosen on the first half, figures reported on the other."""
 RGBD_SETS = ("hololens_lounge", "tum_fr1_rpy")

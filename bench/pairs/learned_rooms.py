@@ -3,9 +3,9 @@
 
     python -m bench.pairs.learned_rooms
 
-Seeds are not those of the rooms to learn from (`bench.training.rooms`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m to
-35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.sources.with_depth_of` puts a network's in its
-place.
+Seeds are not those of the rooms to learn from (`bench.training.rooms`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m
+to 35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.sources.with_depth_of` puts a network's
+in its place.
 """
 
 from __future__ import annotations

@@ -13,15 +13,15 @@ from rich.console import Console
 
 from bench.pairs import bare, learned_rooms
 from bench.pairs.datasets import DATA, HALVES, Pair, read_pairs, scene_points, spread, with_monocular_depth
+from bench.pairs.readers import READERS, load
 from bench.pairs.readers.pair_list import RAW
-from bench.readers import READERS, load
 from garps_core import Config, GarpsError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models.in_use import depth_network_of
 
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
 NAMES = (PAIRS, ROOMS, BARE, *READERS)
-"""`pairs`: a folder with a pairs.json; `rooms`, `bare`: generated, into the folder; the others: `bench.readers`."""
+"""`pairs`: a folder with a pairs.json; `rooms`, `bare`: generated; the others: `bench.pairs.readers`."""
 SENSOR, MONOCULAR, DEMO_NET = "sensor", "monocular", "demo_net"
 DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", DEMO_NET: "demo_net", "depth_anything_v2": "monocular"}
 """Whose depth: the set's own, the same spoilt as a network would, or a network's; and the preset that goes with it."""

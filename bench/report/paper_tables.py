@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Markdown tables in the layout of the paper, and those it lacks: of all pairs, paired, by category, by length.
 
-Rows are those of `bench.rows.evaluate`. The paper's numbers are over each method's own successes, and cannot be compared
-where methods fail on different pairs; so every table says how many pairs and failures it is of, and where the unit of
-the true translations comes from. The best of a column, as rounded, is bold. A table of no rows is empty text.
+Rows are those of `bench.rows.evaluate`. The paper's numbers are over each method's own successes, and cannot be
+compared where methods fail on different pairs; so every table says how many pairs and failures it is of, and where the
+unit of the true translations comes from. The best of a column, as rounded, is bold. A table of no rows is empty text.
 """
 
 from __future__ import annotations

@@ -36,8 +36,8 @@ def evaluate(
         config: settings of GARPS; its `start.method` is set here.
         pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
         start: one of `STARTS`.
-        methods: names from `bench.rows.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where the start
-            comes from it.
+        methods: names from `bench.rows.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where
+            the start comes from it.
         seed: of the disturbance.
     Returns: rows, per pair first "(start)", then the methods in order.
     """

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the errors of a method are summed up to: its own successes, all pairs, or the pairs that every method solved.
 
-Rows are those of `bench.rows.evaluate`, one per depth, set, start, pair and method. A mean or a spread exists over poses
-only, and flatters methods that fail on hard pairs; a median and an AUC exist over all pairs with failures at infinity;
-over the common subset methods may be compared by their means. Each comes with its n. Pairs for which the truth defines
-no such error (E_3D without points, the direction of no motion) are left out, for every method alike.
+Rows are those of `bench.rows.evaluate`, one per depth, set, start, pair and method. A mean or a spread exists over
+poses only, and flatters methods that fail on hard pairs; a median and an AUC exist over all pairs with failures at
+infinity; over the common subset methods may be compared by their means. Each comes with its n. Pairs for which the
+truth defines no such error (E_3D without points, the direction of no motion) are left out, for every method alike.
 """
 
 from __future__ import annotations

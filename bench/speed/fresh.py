@@ -74,7 +74,7 @@ def in_fresh_process(task: str, arrays: dict[str, Any], preset: str) -> dict[str
         path = Path(folder) / "input.npz"
         np.savez(path, **arrays)
         command = [sys.executable, "-m", "bench.speed.fresh", task, str(path), preset]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
     if done.returncode != 0:
         raise RuntimeError(f"the fresh process failed: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

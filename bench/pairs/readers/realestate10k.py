@@ -123,7 +123,7 @@ def read(
     folder: Path, *, limit: int | None = None, skipped: list[str] | None = None, split: str = "test"
 ) -> list[Pair]:
     """The pairs of the list that `sample` wrote, and nothing else; arguments as for `pair_list.read`."""
-    require(f"the list that `bench.readers.{NAME}.sample` writes", folder / list_file(split))
+    require(f"the list that `bench.pairs.readers.{NAME}.sample` writes", folder / list_file(split))
     return pair_list.read(folder, limit=limit, skipped=skipped, list_file=list_file(split), name=NAME)
 
 
