@@ -12,8 +12,8 @@ import cv2
 import golden_rule
 import numpy as np
 import torch
+from box_room import TRUTH, K, room
 from safetensors.torch import save_file
-from test_cli import TRUTH, K, room
 from torch import nn
 
 from garps_core import View

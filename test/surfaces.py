@@ -18,6 +18,7 @@ torch.set_num_threads(1)  # threads that wait for each other on a shared machine
 
 SIZE = (120, 160)
 K = np.array([[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]])
+HALF = {"camera": np.diag([0.5, 0.5, 1]) @ K, "size": (60, 80)}
 TRUTH = se3_exp(np.array([0.15, -0.05, 0.08, 0.03, 0.08, -0.02]))
 DISTURBANCE = np.array([0.06, -0.05, 0.06, 0.010, -0.012, 0.008])  # 0.1 m and 1 degree
 FREE = np.diag([0.1**2] * 3 + [np.radians(1.5) ** 2] * 3)

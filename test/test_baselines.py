@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peers find the pose of a small generated pair, and answer with a reason where there is none to be found."""
 
+from __future__ import annotations
+
 import dataclasses
 
 import numpy as np
 import pytest
+from installed_peers import ON_THE_WALL, method
 
 from bench.pairs import datasets
 from bench.peers.baselines import METHODS, NEED_NO_START
@@ -14,28 +17,6 @@ from bench.peers.registration import FAST_LEVELS, cloud, without_edges
 from bench.scoring import tables
 from garps_core import View, metrics
 from garps_core.geometry import project, se3_exp, transform
-
-NEEDS = {
-    "small-gicp": ("small_gicp",),
-    "sift-pnp": ("poselib",),
-    "sift-pnp-oneway": ("poselib",),
-    "sift-pnp+small-gicp": ("poselib", "small_gicp"),
-    "five-point": ("poselib",),
-    "colmap": ("pycolmap",),
-    "colmap-relaxed": ("pycolmap",),
-    "cpd": ("cpd_pytorch", "open3d"),
-    "kiss-matcher+gicp": ("kiss_matcher", "open3d"),
-    "mast3r": (),
-    "dust3r": (),
-}
-ON_THE_WALL = [name for name in METHODS if name.startswith(("open3d", "small", "rgbd", "sift", "kiss"))]
-"""The others are tried in a room: `test_baselines_sfm.py`."""
-
-
-def method(name):
-    for module in NEEDS.get(name, ("open3d",)):
-        pytest.importorskip(module)
-    return METHODS[name]
 
 
 def textured_wall(T_target_source=None, shape=(240, 320)):

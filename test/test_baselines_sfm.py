@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("embreex")
 
+from installed_peers import ON_THE_WALL, method
 from network_weights import install_reduced
 from point_map_cases import point_maps
-from test_baselines import ON_THE_WALL, method
 
 from bench.pairs.datasets import Pair, disturbed, rng_of, scene_points
 from bench.peers import metres

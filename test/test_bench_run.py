@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The evaluation bench on two small pairs in the pairs.json layout: every method, twice the same, stopped, resumed."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
+from bench_command import called
 from dask_cluster import running_cluster
 from typer.testing import CliRunner
 
@@ -49,14 +52,6 @@ def write_rooms(place: Path) -> Path:
         records.append(record)
     (place / "pairs.json").write_text(json.dumps({"pairs": records}))
     return place
-
-
-def called(*words: str) -> tuple[int, str]:
-    app = typer.Typer()
-    app.command()(run.main)
-    found = CliRunner().invoke(app, [str(word) for word in words])
-    assert found.exception is None or isinstance(found.exception, SystemExit), found.exception
-    return found.exit_code, found.output
 
 
 def rows_in(out: Path) -> list[dict]:

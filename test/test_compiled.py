@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled loops say what torch and SciPy say: to 1e-5, to the last bit again, from several threads, or not at all."""
 
+from __future__ import annotations
+
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from surfaces import TRUTH, K, disturbed, off, random_mixture, random_pose, two_mixtures
+from surfaces import HALF, TRUTH, disturbed, off, random_mixture, random_pose, two_mixtures
 
 from garps_core import Config, align_mixtures
 from garps_core.config import Alignment, Rung
@@ -23,7 +25,6 @@ CLOSE = 1e-5
 SETTINGS = Alignment(colour_variance=0.05, outlier_floor=0.01)
 RUNG = Rung(4.0, 4000, 10, 1)
 KINDS = ("surface", "scattered")
-HALF = {"camera": np.diag([0.5, 0.5, 1]) @ K, "size": (60, 80)}
 
 
 def clouds(kind, config=None):
@@ -225,8 +226,7 @@ def test_without_numba_everything_works():
     program = """
 import sys
 sys.modules["numba"] = None
-from surfaces import disturbed, two_mixtures
-from test_compiled import HALF
+from surfaces import HALF, disturbed, two_mixtures
 from garps_core import Config, align_mixtures
 from garps_core.objective import compiled
 assert not compiled.AVAILABLE and compiled.exponential(0.0) == 1.0

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mask2Former on ViT-Adapter, reduced and random: its parts against plain formulas, its sizes, and every parameter."""
 
+from __future__ import annotations
+
 import math
 
 import golden_rule
 import numpy as np
 import pytest
 import torch
+from small_mask2former import ADAPTER, HEAD, random_state
 from torch.nn import functional as F
 
 from garps_core.errors import InputError, WeightsError
@@ -21,36 +24,7 @@ from garps_core.models.deformable import (
 from garps_core.models.mask2former import HeadSize, Mask2Former, mask2former_of, segment_by_masks
 from garps_core.models.vit_adapter import AdapterSize
 
-ADAPTER = AdapterSize(width=64, blocks=4, hidden=48, groups=4, heads=4, values=32, convolved=16)
-HEAD = HeadSize(
-    width=32,
-    masks=24,
-    heads=4,
-    encoder_layers=2,
-    decoder_layers=4,
-    encoder_hidden=40,
-    decoder_hidden=56,
-    queries=9,
-    classes=7,
-)
 GRIDS = [(7, 9), (4, 5), (2, 3)]
-
-
-def random_state(network: torch.nn.Module, seed: int = 0) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    found = {}
-    for key, like in network.state_dict().items():
-        value = torch.randn(like.shape, generator=generator)
-        if key.endswith("num_batches_tracked"):
-            value = torch.zeros((), dtype=torch.int64)
-        elif key.endswith("running_var"):
-            value = 1 + 0.3 * value.tanh()
-        elif like.dim() == 1 and key.endswith("weight"):
-            value = 1 + 0.1 * value
-        else:
-            value = value * (0.2 if like.dim() == 1 else 1 / math.sqrt(like[0].numel()))
-        found[key] = value
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from box_room import K_WORDS, START, TRUTH
 from network_weights import GOLDEN, install, pair, passes, write_pair
-from test_cli import K_WORDS, START, TRUTH
-from test_mask2former import ADAPTER, HEAD, random_state
+from small_mask2former import ADAPTER, HEAD, random_state
 
 from garps_core import Config, Prior, align_mixtures, metrics
 from garps_core.cli import command

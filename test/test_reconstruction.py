@@ -11,8 +11,8 @@ import golden_rule
 import numpy as np
 import pytest
 import torch
+from box_room import K
 from network_weights import DEPTH, install, pair, passes, tensors
-from test_cli import K
 
 from garps_core import Config, Status, View, estimate_relative_pose
 from garps_core.cli import command

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from test_bench_run import called as run_called
-from test_readers import motion, write_frames, write_sparse, write_track
+from bench_command import called as run_called
+from clips import motion, write_frames, write_sparse, write_track
 from typer.testing import CliRunner
 
 from bench import sample

@@ -5,7 +5,7 @@ import golden_rule
 import numpy as np
 import pytest
 import torch
-from test_splats import random_mixture
+from random_splats import random_mixture
 from torch.nn import functional as F
 
 from garps_core import Config

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_splats import random_mixture
+from random_splats import random_mixture
 
 from garps_core import Config
 from garps_core.errors import InputError

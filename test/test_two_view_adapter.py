@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from box_room import K_WORDS
 from network_weights import write_pair
 from point_map_cases import Errors, point_maps, true_views
-from test_cli import K_WORDS
 from two_view_fixtures import CALLS, FAULTS, RECORDED, installed_here, installed_package, write_maps
 
 from bench.rooms import RoomPair, make_pair

@@ -13,10 +13,10 @@ from typing import Any
 import cv2
 import pytest
 import torch
+from box_room import K_WORDS
 from network_weights import DEPTH, FLASH3D, install, install_reduced, passes, reduced_tensors, write_pair
 from safetensors.torch import save_file
-from test_cli import K_WORDS
-from test_mask2former import ADAPTER, HEAD, random_state
+from small_mask2former import ADAPTER, HEAD, random_state
 
 from garps_core import Config
 from garps_core.cli import command
