@@ -2,8 +2,9 @@
 """The same arithmetic as `shape.py` and `pairs.py` in compiled loops, used on a CPU when numba is installed.
 
 Nothing here decides anything: every function has a torch or SciPy counterpart beside its caller, which gives the same
-numbers to 1e-5 (`test/test_compiled.py`). Loops release the interpreter, so that both directions run at once. One flat
-scratch array with constant offsets lets the compiler see that nothing overlaps, so it works on 8 or 16 rows at a time.
+numbers to 1e-5 (`test/core/objective/test_compiled.py`). Loops release the interpreter, so that both directions run at
+once. One flat scratch array with constant offsets lets the compiler see that nothing overlaps, so it works on 8 or 16
+rows at a time.
 """
 
 from __future__ import annotations
