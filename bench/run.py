@@ -126,7 +126,9 @@ def main(
     starts: Annotated[str, typer.Option(help=f"comma-separated from {', '.join(STARTS)}; default: by the set")] = "",
     methods: Annotated[str, typer.Option(help="comma-separated; see --list")] = BY_DEFAULT,
     settings: Annotated[Path | None, typer.Option(help="YAML of settings, as bench.tune writes")] = None,
-    change: Annotated[list[str] | None, typer.Option(help='setting of GARPS, as "alignment.information=100"')] = None,
+    change: Annotated[
+        list[str] | None, typer.Option(help='setting of GARPS, as "alignment.effective_measurements=100"')
+    ] = None,
     limit: Annotated[
         int | None, typer.Option(help="at most so many pairs of a set: spread evenly, of learned rooms the first")
     ] = None,

@@ -57,14 +57,14 @@ from garps_core.metrics import CHI2_6_95
 
 SPACES: dict[str, dict[str, tuple[float, float]]] = {
     SENSOR: {
-        "alignment.information": (10.0, 120.0),
+        "alignment.effective_measurements": (10.0, 120.0),
         "alignment.colour_variance": (0.005, 0.1),
         "alignment.outlier_floor": (3e-4, 0.03),
         "start.covariance_inflation": (1.5, 4.0),
     },
     MONOCULAR: {
-        "alignment.information": (1.5, 20.0),
-        "alignment.brightness": (0.01, 0.2),
+        "alignment.effective_measurements": (1.5, 20.0),
+        "alignment.brightness_measurements": (0.01, 0.2),
         "alignment.colour_variance": (0.005, 0.1),
         "alignment.outlier_floor": (3e-4, 0.03),
         "start.covariance_inflation": (1.5, 4.0),
@@ -73,8 +73,8 @@ SPACES: dict[str, dict[str, tuple[float, float]]] = {
         "lifting.patch_sigma": (0.01, 0.1),
     },
     DEMO_NET: {
-        "alignment.information": (0.03, 10.0),
-        "alignment.brightness": (5e-4, 0.1),
+        "alignment.effective_measurements": (0.03, 10.0),
+        "alignment.brightness_measurements": (5e-4, 0.1),
         "alignment.outlier_floor": (3e-4, 0.03),
         "start.covariance_inflation": (2.0, 40.0),
         "lifting.scale_sigma": (0.03, 0.4),

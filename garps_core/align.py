@@ -12,14 +12,14 @@ import numpy as np
 import torch
 
 from garps_core.config import Alignment, Config
-from garps_core.depth_errors import DEPTH_MODES, shared_sigmas
+from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_depth
-from garps_core.objective.brightness import sharpen
-from garps_core.objective.pairs import Cloud, overlap, to_cloud
-from garps_core.objective.state import Belief
+from garps_core.objective.brightness import fit_brightness
+from garps_core.objective.pairs import DeviceMixture, overlap, to_device
+from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
 from garps_core.solver.search import search
@@ -179,7 +179,7 @@ class _OneThread(ContextDecorator):
 
 @_OneThread()
 def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -> PoseEstimate:
-    x, y = to_cloud(source, config), to_cloud(target, config)
+    x, y = to_device(source, config), to_device(target, config)
     settings = config.alignment
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
@@ -218,13 +218,13 @@ def _too_little(shared: float, initial: Prior, settings: Alignment) -> PoseEstim
     return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
 
 
-def _known(initial: Prior, config: Config) -> Belief:
+def _known(initial: Prior, config: Config) -> WeightedStart:
     """The initial pose as a measurement, and where they are solved for, what depth maps usually get wrong."""
     precision = np.linalg.inv(twist_from_ros(initial.covariance, initial.T_target_source))
     of_errors = np.zeros(0)
     if config.alignment.depth_errors and config.alignment.solver != "adam":
-        of_errors = np.tile(1 / np.maximum(shared_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
-    return Belief(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
+        of_errors = np.tile(1 / np.maximum(error_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
+    return WeightedStart(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
 
 
 def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
@@ -233,14 +233,18 @@ def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
     return np.asarray(covariance + sigma**2 * np.outer(along, along))
 
 
-def _finding(solution: Solution, x: Cloud, y: Cloud, known: Belief, guess: bool, config: Config) -> Finding:
+def _finding(
+    solution: Solution, x: DeviceMixture, y: DeviceMixture, known: WeightedStart, guess: bool, config: Config
+) -> Finding:
     """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
     covariance, kept, seen = pose_covariance(solution, known, config.lifting), np.eye(6), None
     if x.frustum is not None and y.frustum is not None:
         prior = twist_from_ros(covariance, T) * (SEARCHED_SIGMAS**2 if guess else 1.0)
-        seen = sharpen(x.frustum, y.frustum, T, prior, settings.brightness, shared_sigmas(config.lifting))
-    if seen is not None and settings.brightness > 0:
+        seen = fit_brightness(
+            x.frustum, y.frustum, T, prior, settings.brightness_measurements, error_sigmas(config.lifting)
+        )
+    if seen is not None and settings.brightness_measurements > 0:
         T, covariance, kept = seen.T, ros_from_twist(seen.covariance, seen.T), seen.kept
     if config.lifting.sigma_inflation > 1:
         of_known = ros_from_twist(kept @ share_of_known(solution, known) @ kept.T, T)

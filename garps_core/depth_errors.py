@@ -36,7 +36,7 @@ def depth_modes(points: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1)
 
 
-def shared_errors(points: Array) -> Array:
+def error_fields(points: Array) -> Array:
     """Points (n, 3) m in the camera that measured them -> (n, 3, 8) displacement per unit of each mode."""
     fields = np.zeros((len(points), 3, 8))
     fields[:, :, :6] = points[:, :, None] * depth_modes(torch.from_numpy(points)).numpy()[:, None, :]
@@ -44,7 +44,7 @@ def shared_errors(points: Array) -> Array:
     return fields
 
 
-def shared_sigmas(lifting: Lifting) -> Array:
+def error_sigmas(lifting: Lifting) -> Array:
     """Sigmas (8,) of the modes."""
     return np.array([lifting.scale_sigma] + [lifting.warp_sigma] * 5 + [lifting.pointing_sigma_rad] * 2)
 

@@ -77,9 +77,9 @@ VARIANTS: dict[str, Variant] = {
     "garps-labels": Variant("pairs of different true labels count less", labels=True),
     "garps-isotropic": Variant("balls of the same volume", mixture=isotropic),
     "garps-no-colour": Variant(
-        "neither colour nor brightness", {"alignment.colour_variance": 100.0, "alignment.brightness": 0.0}
+        "neither colour nor brightness", {"alignment.colour_variance": 100.0, "alignment.brightness_measurements": 0.0}
     ),
-    "garps-no-brightness": Variant("not sharpened by brightness", {"alignment.brightness": 0.0}),
+    "garps-no-brightness": Variant("not sharpened by brightness", {"alignment.brightness_measurements": 0.0}),
     "garps-equal-weights": Variant("every pixel counts the same, not the area it sees", {"lifting.weighting": "equal"}),
     "garps-no-visibility": Variant("neither visibility nor brightness", mixture=without_frustum),
     "garps-no-annealing": Variant("the finest rung only", settings=last_rung),

@@ -15,7 +15,7 @@ from bench.speed.fresh import STEPS, all_used
 from bench.speed.parts import Check, Inputs, Row, Section, lifted, threads
 from garps_core import Mixture, align_mixtures
 from garps_core.config import Rung
-from garps_core.objective.pairs import pair_up, to_cloud
+from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate
 
 Found = TypeVar("Found")
@@ -69,7 +69,7 @@ def measure(full: tuple[Mixture, Mixture], n: int, k: int, inputs: Inputs) -> Ro
     """Seconds of the three stages with n components and k neighbours, once each (evaluation: the median of a few)."""
     source, target = (subset(mixture, n) for mixture in full)
     config, T = all_used(inputs.config, n, k), inputs.prior.T_target_source
-    x, y = (to_cloud(mixture, config) for mixture in (source, target))
+    x, y = (to_device(mixture, config) for mixture in (source, target))
     rung = Rung(config.alignment.ladder[-1].covariance_scale, n, k)
     row: Row = {"components": n, "neighbours": k}
     with threads(1):

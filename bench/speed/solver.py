@@ -17,7 +17,7 @@ from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians,
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
-from garps_core.objective.pairs import to_cloud
+from garps_core.objective.pairs import to_device
 from garps_core.objective.shape import Pairs, evaluate, unpack
 from garps_core.objective.state import State
 from garps_core.solver import ladder, paper
@@ -48,7 +48,7 @@ class Contest:
     def paper_pairs(self) -> Pairs:
         """What the paper's solver works on. Raises RuntimeError when too little is left."""
         config = self.configs[PAPER]
-        source, target = (to_cloud(mixture, config) for mixture in self.mixtures[PAPER])
+        source, target = (to_device(mixture, config) for mixture in self.mixtures[PAPER])
         pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.alignment)
         if pairs is None:
             raise RuntimeError("the paper's preset keeps fewer than 50 components of this pair: give a larger one")
@@ -57,12 +57,12 @@ class Contest:
     def same_problem(self) -> Float64Array:
         """End pose of the default solver's steps on what the paper's solver works on: its objective, its pairs."""
         pairs, start = self.paper_pairs(), State(self.prior.T_target_source)
-        known = ladder.Belief(start.T, 1e-9 * np.eye(6))
+        known = ladder.WeightedStart(start.T, 1e-9 * np.eye(6))
 
         def function(at: State) -> ladder.Posterior:
             return ladder.posterior(evaluate(pairs, at.T, "sum"), at, known, 1.0)
 
-        return ladder.climb(function, start, SAME_STEPS, 1e-3).at.T
+        return ladder.ascend(function, start, SAME_STEPS, 1e-3).at.T
 
     def published(self) -> Float64Array:
         """End pose of the paper's steps on the same, pairs chosen anew as above."""
@@ -73,7 +73,7 @@ class Contest:
     def rung_pairs(self, rung: Rung, T: Float64Array) -> tuple[Pairs, Pairs]:
         """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
         config = self.configs[DEFAULT]
-        source, target = (to_cloud(mixture, config) for mixture in self.mixtures[DEFAULT])
+        source, target = (to_device(mixture, config) for mixture in self.mixtures[DEFAULT])
         pairs = ladder.rung_pairs(source, target, T, rung, config.alignment, config.alignment.partner_density)
         if pairs is None:
             raise RuntimeError("fewer than 50 components are seen by both views: give another pair")

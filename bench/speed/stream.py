@@ -14,7 +14,7 @@ from bench.speed.parts import Check, Inputs, Row, Section, imported_numba, inter
 from garps_core import Config, Mixture
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
-from garps_core.objective.pairs import pair_up, thin, to_cloud
+from garps_core.objective.pairs import pair_up, thin, to_device
 from garps_core.objective.shape import Pairs, evaluate
 
 SIZES = ((8000, 12), (2000, 20))
@@ -48,7 +48,7 @@ def stream_section(inputs: Inputs, sizes: tuple[tuple[int, int], ...] = SIZES) -
 
 def exact_pairs(mixtures: tuple[Mixture, Mixture], T: Float64Array, n: int, k: int, config: Config) -> Pairs:
     """Pairs of exactly n rows (ValueError when there are fewer) with k partners each, by the last rung."""
-    rows, partners = (to_cloud(mixture, config) for mixture in mixtures)
+    rows, partners = (to_device(mixture, config) for mixture in mixtures)
     if len(rows) < n:
         raise ValueError(f"the mixture has {len(rows)} components, {n} rows are wanted: give larger images")
     scale = config.alignment.ladder[-1].covariance_scale

@@ -56,7 +56,7 @@ class Alignment(Checked):
         Rung(4.0, 4000, 12, 8),
         Rung(2.0, 5000, 12, 20),
     )
-    search_followed: int = setting(4, "how many beginnings of a search are followed to the end", low=1, high=100)
+    search_followed: int = setting(4, "how many starting_poses of a search are followed to the end", low=1, high=100)
     partner_density: float = setting(
         1.0, "partners kept for each kernel-sized patch of a mixture; at least the rung's components", low=0, high=100
     )
@@ -84,10 +84,13 @@ class Alignment(Checked):
     depth_errors: bool = setting(
         False, "solve for what each depth map gets wrong as a whole (`lifting.scale_sigma`, `lifting.warp_sigma`)"
     )
-    brightness: float = setting(
-        0.0, "independent measurements that a point's brightness is worth, 0 = do not sharpen by it", low=0, high=10
+    brightness_measurements: float = setting(
+        0.0,
+        "independent measurements that a point's brightness is worth, 0 = do not fit_brightness by it",
+        low=0,
+        high=10,
     )
-    information: float = setting(
+    effective_measurements: float = setting(
         30.0, "effective number of independent measurements in the data term (calibrated)", low=1e-3, high=1e6
     )
     tolerance: float = setting(0.02, "a step shorter than this many of its own sigmas is converged", low=1e-9, high=1)

@@ -80,8 +80,8 @@ def _monocular() -> Config:
             ladder=ladder,
             search_ladder=Alignment().search_ladder[:2] + ladder[1:],
             depth_errors=True,
-            brightness=0.04,
-            information=5.0,
+            brightness_measurements=0.04,
+            effective_measurements=5.0,
         ),
     )
 
@@ -134,8 +134,8 @@ def _demo_net() -> Config:
             "lifting.noise_linear": 0.1,
             "start.covariance_inflation": 5.0,
             "start.min_inliers": 15,
-            "alignment.information": 0.3,
-            "alignment.brightness": 0.02,
+            "alignment.effective_measurements": 0.3,
+            "alignment.brightness_measurements": 0.02,
             "alignment.occlusion_ratio": 0.5,
         }
     )

@@ -41,7 +41,7 @@ class Start(Checked):
     network_scale_sigma: float = setting(0.1, "relative error of a two-view network's metre", low=0, high=1)
     network_warp_sigma: float = setting(0.02, "relative smooth warp of a two-view network's points", low=0, high=1)
     focal_sigma: float = setting(0.05, "relative error of a focal length that a network has estimated", low=0, high=1)
-    features: bool = setting(True, "match features also where a prior is given: they check and sharpen it")
+    features: bool = setting(True, "match features also where a prior is given: they check and fit_brightness it")
     max_contradiction: float = setting(
         5.0, "given prior and features further apart than this are two rivals", unit="sigma", low=1, high=1e6
     )

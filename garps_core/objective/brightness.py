@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array
-from garps_core.depth_errors import shared_errors
+from garps_core.depth_errors import error_fields
 from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
 
@@ -45,7 +45,7 @@ SMALLEST_SIGMA = 2e-3
 
 
 @dataclass(frozen=True)
-class Sharpened:
+class BrightnessFit:
     """Pose T (4x4) and its covariance (6x6, left twist), and how well brightness agrees there."""
 
     T: Array
@@ -98,9 +98,9 @@ class Comparison:
     share: float
 
 
-def sharpen(
+def fit_brightness(
     source: Frustum, target: Frustum, T: Array, covariance: Array, information: float, sigmas: Array
-) -> Sharpened | None:
+) -> BrightnessFit | None:
     """The pose where brightness and the prior agree best; None where too little is seen, or a view has no brightness.
 
     Args:
@@ -128,7 +128,7 @@ def sharpen(
         effect = held @ (weight * pull) * sigmas
         spread += effect @ effect.T
     agreement = min(f.correlation, b.correlation), min(f.share, b.share)
-    return Sharpened(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(held @ precision))
+    return BrightnessFit(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(held @ precision))
 
 
 def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
@@ -143,18 +143,18 @@ def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: fl
     return at
 
 
-def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array) -> Sharpened | None:
+def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array) -> BrightnessFit | None:
     x, y = grid_of(source, GRIDS[-1]), grid_of(target, GRIDS[-1])
     f, b = _overlaid(x, y, T), _overlaid(y, x, se3_inverse(T))
     if f is None or b is None:
         return None
-    return Sharpened(T, covariance, min(f.correlation, b.correlation), min(f.share, b.share))
+    return BrightnessFit(T, covariance, min(f.correlation, b.correlation), min(f.share, b.share))
 
 
 @lru_cache(maxsize=16)
 def grid_of(view: Frustum, step: int) -> Grid:
     """Every `step`-th cell of what a camera saw; kept, because a search asks for the same again and again."""
-    assert view.brightness is not None  # noqa: S101 - `sharpen` has looked
+    assert view.brightness is not None  # noqa: S101 - `fit_brightness` has looked
     image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
     image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step], np.float32)
     depth = view.depth[step // 2 :: step, step // 2 :: step]
@@ -221,7 +221,7 @@ def _compared(x: Grid, y: Grid, T: Array) -> Comparison | None:
     weighted = exposure * weights[:, None]
     J = J - exposure @ np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ J)  # exposure is free
     JW = (J * weights[:, None]).T
-    fields = T[:3, :3] @ shared_errors(x.points[seen.inside])
+    fields = T[:3, :3] @ error_fields(x.points[seen.inside])
     of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
     return Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
 

@@ -22,7 +22,7 @@ NEAREST_Z_M = 1e-3
 
 
 @dataclass(frozen=True)
-class Cloud:
+class DeviceMixture:
     """A mixture on the device: means (n, 3), covariances (n, 6), weights (n,), colours (n, 3), labels (n,) or None."""
 
     means: Tensor
@@ -35,7 +35,7 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.means)
 
-    def take(self, index: Tensor) -> Cloud:
+    def take(self, index: Tensor) -> DeviceMixture:
         """Components `index` (bool mask or integers)."""
         if index.dtype == torch.bool:
             index = index.nonzero().squeeze(1)  # once, not for every part
@@ -43,10 +43,10 @@ class Cloud:
         means, covariances, weights, colours = (
             part.index_select(0, index) for part in (self.means, self.covariances, self.weights, self.colours)
         )
-        return Cloud(means, covariances, weights, colours, labels, self.frustum)
+        return DeviceMixture(means, covariances, weights, colours, labels, self.frustum)
 
 
-def to_cloud(mixture: Mixture, config: Config) -> Cloud:
+def to_device(mixture: Mixture, config: Config) -> DeviceMixture:
     """Move a mixture to the device and arithmetic of the config. Raises ConfigError when the device is not there."""
     device = checked_device(config.device)
     dtype = torch.float64 if config.dtype == "float64" else torch.float32
@@ -55,10 +55,10 @@ def to_cloud(mixture: Mixture, config: Config) -> Cloud:
         for part in (mixture.means, mixture.covariances, mixture.weights, mixture.colours)
     )
     labels = None if mixture.labels is None else torch.as_tensor(mixture.labels, device=device)
-    return Cloud(means, pack(covariances), weights, colours, labels, mixture.frustum)
+    return DeviceMixture(means, pack(covariances), weights, colours, labels, mixture.frustum)
 
 
-def thin(cloud: Cloud, components: int) -> Cloud:
+def thin(cloud: DeviceMixture, components: int) -> DeviceMixture:
     """An even subsample of at most `components` by index; lifted mixtures are listed along a space-filling curve."""
     if len(cloud) <= components:
         return cloud
@@ -66,7 +66,7 @@ def thin(cloud: Cloud, components: int) -> Cloud:
     return cloud.take(index.long())
 
 
-def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: float) -> Tensor:
+def visible(cloud: DeviceMixture, T: Array, other: Frustum | None, occlusion_ratio: float) -> Tensor:
     """Mask (n,) of components that the other camera sees when moved by T: in its image, not behind its depth."""
     if other is None:
         return torch.ones(len(cloud), dtype=torch.bool, device=cloud.means.device)
@@ -88,14 +88,14 @@ def visible(cloud: Cloud, T: Array, other: Frustum | None, occlusion_ratio: floa
     return inside & ~hidden
 
 
-def overlap(source: Cloud, target: Cloud, T: Array, settings: Alignment) -> float:
+def overlap(source: DeviceMixture, target: DeviceMixture, T: Array, settings: Alignment) -> float:
     """Smaller of the two shares of components that the other camera sees under T, 0..1."""
     ahead = visible(source, T, target.frustum, settings.occlusion_ratio)
     back = visible(target, se3_inverse(T), source.frustum, settings.occlusion_ratio)
     return min(float(ahead.double().mean()), float(back.double().mean()))
 
 
-def pair_up(rows: Cloud, partners: Cloud, T: Array, rung: Rung, settings: Alignment) -> Pairs:
+def pair_up(rows: DeviceMixture, partners: DeviceMixture, T: Array, rung: Rung, settings: Alignment) -> Pairs:
     """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances widened by the rung."""
     index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)), settings.depth_weight)
     means, covariances, log_weights = _gathered(rows, partners, index, rung, settings)
@@ -123,7 +123,7 @@ def widened(covariances: Tensor, rung: Rung) -> Tensor:
 
 
 def _gathered(
-    rows: Cloud, partners: Cloud, index: Tensor, rung: Rung, settings: Alignment
+    rows: DeviceMixture, partners: DeviceMixture, index: Tensor, rung: Rung, settings: Alignment
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Of each row's partners, index (n, k): means (3, k, n), covariances (6, k, n), log weights (k, n).
 
@@ -147,7 +147,9 @@ def _gathered(
     )
 
 
-def _nearest(rows: Cloud, partners: Cloud, T: Array, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
+def _nearest(
+    rows: DeviceMixture, partners: DeviceMixture, T: Array, k: int, depth_weight: float
+) -> tuple[Tensor, Tensor]:
     """Indices and distances (n, k) of the nearest partners; metres, or image coordinates if depth_weight < 1."""
     like = rows.means
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
@@ -175,7 +177,7 @@ def image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
     return torch.cat([points[:, :2] / z, depth_weight * torch.log(z)], dim=1)
 
 
-def _log_floor(covariances: Tensor, partners: Cloud, floor: float) -> Tensor:
+def _log_floor(covariances: Tensor, partners: DeviceMixture, floor: float) -> Tensor:
     """log o_i: `floor` times what one partner of mean weight gives a row of the same covariance at distance zero."""
     a, b, c, e, f, i = (2 * covariances).double().unbind(-1)
     det = a * (e * i - f * f) - b * (b * i - c * f) + c * (b * f - c * e)

@@ -23,7 +23,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Belief:
+class WeightedStart:
     """What is known beforehand: the pose T, its precision (6, 6) over the left twist, and that of the errors (e,)."""
 
     T: Array

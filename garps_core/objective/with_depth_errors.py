@@ -22,14 +22,14 @@ from torch import Tensor
 
 from garps_core.depth_errors import DEPTH_MODES, depth_modes
 from garps_core.geometry import Array, adjoint, se3_inverse
-from garps_core.objective.pairs import Cloud
+from garps_core.objective.pairs import DeviceMixture
 from garps_core.objective.shape import Evaluation, Pairs, combine, evaluate, moved_rows, row_sums, unpack
 from garps_core.objective.state import State
 
 MODES = DEPTH_MODES
 
 
-def corrected(cloud: Cloud, errors: Array) -> Cloud:
+def corrected(cloud: DeviceMixture, errors: Array) -> DeviceMixture:
     """The cloud with its means moved along their rays by the given errors (6,) of its depth map, or () for none."""
     if not len(errors):
         return cloud

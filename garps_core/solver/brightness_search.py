@@ -11,7 +11,7 @@ from __future__ import annotations
 from garps_core.geometry import Array
 from garps_core.mixture import Frustum
 from garps_core.objective.brightness import Grid, both_ways, climb_on, grid_of
-from garps_core.objective.state import Belief
+from garps_core.objective.state import WeightedStart
 
 WIDTH_PX = 40
 """Of the small pictures: a basin of some degrees, and still enough points."""
@@ -22,18 +22,20 @@ PURSUED = 24
 """Descents that are carried on after the first steps: the others are worse already."""
 
 
-def glances(source: Frustum, target: Frustum, known: Belief, beginnings: list[Array]) -> list[Array]:
+def search_by_brightness(
+    source: Frustum, target: Frustum, known: WeightedStart, starting_poses: list[Array]
+) -> list[Array]:
     """Poses (4x4) where brightness agrees, best first; none when the views have no brightness or share too little.
 
     Args:
         source, target: what the cameras saw.
         known: the guess with its precision, which holds every descent.
-        beginnings: poses (4x4) to begin from.
+        starting_poses: poses (4x4) to begin from.
     """
     if source.brightness is None or target.brightness is None:
         return []
     x, y = (grid_of(view, max(1, round(view.depth.shape[1] / WIDTH_PX))) for view in (source, target))
-    ends = beginnings
+    ends = starting_poses
     for steps in (FIRST_STEPS, MORE_STEPS):
         moved = [climb_on(x, y, at, known.T, known.precision, INFORMATION, steps) for at in ends]
         ends = [at for merit, at in sorted(((_agreement(x, y, at), at) for at in moved), key=_first) if merit > 0]

@@ -17,9 +17,9 @@ import numpy as np
 
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import Array, displacement, se3_inverse, se3_log, skew
-from garps_core.objective.pairs import Cloud, pair_up, thin, visible
+from garps_core.objective.pairs import DeviceMixture, pair_up, thin, visible
 from garps_core.objective.shape import Evaluation, Pairs, unpack
-from garps_core.objective.state import Belief, State
+from garps_core.objective.state import State, WeightedStart
 from garps_core.objective.with_depth_errors import corrected, evaluate_at, two_sided
 
 _SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
@@ -111,7 +111,7 @@ def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
     return values, L @ vectors, scale
 
 
-def posterior(data: Evaluation, at: State, known: Belief, weight: float) -> Posterior:
+def posterior(data: Evaluation, at: State, known: WeightedStart, weight: float) -> Posterior:
     """Add the prior to `weight` times the data term."""
     r = np.concatenate([se3_log(at.T @ se3_inverse(known.T)), at.errors])
     J, precision = np.eye(len(r)), known.joint()
@@ -125,7 +125,7 @@ def posterior(data: Evaluation, at: State, known: Belief, weight: float) -> Post
 
 
 @dataclass(frozen=True)
-class Climb:
+class Ascent:
     """Where one rung ended."""
 
     at: State
@@ -134,8 +134,8 @@ class Climb:
     converged: bool
 
 
-def climb(function: Callable[[State], Posterior], at: State, steps: int, tolerance: float) -> Climb:
-    """Levenberg-damped ascent: at most `steps` evaluations beyond the first, never downhill.
+def ascend(function: Callable[[State], Posterior], at: State, steps: int, tolerance: float) -> Ascent:
+    """Levenberg-damped ascent: at most `steps` evaluations after the first, never downhill.
 
     Stops when the undamped step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
     """
@@ -145,7 +145,7 @@ def climb(function: Callable[[State], Posterior], at: State, steps: int, toleran
     while used < steps:
         H = here.information
         if float(here.gradient @ np.linalg.solve(H + floor, here.gradient)) < tolerance**2:
-            return Climb(at, here, used, True)
+            return Ascent(at, here, used, True)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + floor, here.gradient)
         candidate = at.moved(np.asarray(step, np.float64))
         there = function(candidate)
@@ -154,11 +154,11 @@ def climb(function: Callable[[State], Posterior], at: State, steps: int, toleran
             at, here, damping = candidate, there, max(damping * 0.2, 1e-6)
         else:
             damping = max(damping, 1e-3) * 10
-    return Climb(at, here, used, False)
+    return Ascent(at, here, used, False)
 
 
 def rung_pairs(
-    source: Cloud, target: Cloud, T: Array, rung: Rung, settings: Alignment, density: float
+    source: DeviceMixture, target: DeviceMixture, T: Array, rung: Rung, settings: Alignment, density: float
 ) -> tuple[Pairs, Pairs] | None:
     """Pairs in both directions among the components that both cameras see under T; None when too few are left.
 
@@ -179,11 +179,11 @@ def rung_pairs(
     return pair_up(x_rows, y_seen, T, rung, settings), other.result()
 
 
-def _at_resolution(cloud: Cloud, rung: Rung, density: float) -> Cloud:
+def _at_resolution(cloud: DeviceMixture, rung: Rung, density: float) -> DeviceMixture:
     return thin(cloud, max(rung.components, int(density * len(cloud) / max(rung.covariance_scale, 1.0))))
 
 
-def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:
+def entry(source: DeviceMixture, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:
     """Index of the first rung worth running: a precise start needs no wide kernels.
 
     covariance is the start's, over the left twist. Its effect on the source points is compared with the rungs' widths.
@@ -199,49 +199,54 @@ def entry(source: Cloud, T: Array, covariance: Array, ladder: tuple[Rung, ...]) 
     return first
 
 
-def anneal(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[Solution]:
+def anneal(source: DeviceMixture, target: DeviceMixture, known: WeightedStart, settings: Alignment) -> list[Solution]:
     """Run the ladder from what is known beforehand: one solution, none when a rung finds too few visible components."""
     covariance = np.asarray(np.linalg.inv(known.precision), np.float64)
     at = State(known.T, np.zeros(len(known.error_precision)))
     rungs = settings.ladder[entry(source, known.T, covariance, settings.ladder) :]
-    solution = descend(source, target, at, known, rungs, settings)
-    return [] if solution is None else [seen_closely(solution, source, target, settings)]
+    solution = run_ladder(source, target, at, known, rungs, settings)
+    return [] if solution is None else [with_final_pairs(solution, source, target, settings)]
 
 
-def descend(
-    source: Cloud, target: Cloud, at: State, known: Belief, rungs: tuple[Rung, ...], settings: Alignment
+def run_ladder(
+    source: DeviceMixture,
+    target: DeviceMixture,
+    at: State,
+    known: WeightedStart,
+    rungs: tuple[Rung, ...],
+    settings: Alignment,
 ) -> Solution | None:
-    """Climb on one rung after the other, each on pairs chosen where the last one ended."""
+    """Ascent on one rung after the other, each on pairs chosen where the last one ended."""
     used, solution = 0, None
     for rung in rungs:
         pairs = pairs_at(source, target, at, rung, settings, settings.partner_density)
         if pairs is None:
             return None
-        weight = settings.information * worth(rung)
+        weight = settings.effective_measurements * data_weight(rung)
 
         def function(
             there: State, pairs: tuple[Pairs, Pairs] = pairs, weight: float = weight, base: State = at
         ) -> Posterior:
-            return posterior(two_way(*pairs, beyond(there, base)), there, known, weight)
+            return posterior(two_way(*pairs, relative_to(there, base)), there, known, weight)
 
-        end = climb(function, at, rung.steps, settings.tolerance)
+        end = ascend(function, at, rung.steps, settings.tolerance)
         at, used = end.at, used + end.iterations
         solution = Solution(at, end.posterior, used, end.converged, weight, end.posterior.data)
     return solution
 
 
-def beyond(at: State, base: State) -> State:
+def relative_to(at: State, base: State) -> State:
     """The state as pairs that are corrected by the errors of `base` see it."""
     return State(at.T, at.errors - base.errors)
 
 
-def worth(rung: Rung) -> float:
+def data_weight(rung: Rung) -> float:
     """How much a rung's data term counts: wider kernels anneal, they do not measure less."""
     return max(rung.covariance_scale, (0.5 * rung.blur_m / FOOTPRINT_M) ** 2)
 
 
 def pairs_at(
-    source: Cloud, target: Cloud, at: State, rung: Rung, settings: Alignment, density: float
+    source: DeviceMixture, target: DeviceMixture, at: State, rung: Rung, settings: Alignment, density: float
 ) -> tuple[Pairs, Pairs] | None:
     """`rung_pairs` of the clouds as the state's errors correct them."""
     half = len(at.errors) // 2
@@ -249,11 +254,13 @@ def pairs_at(
     return rung_pairs(x, y, at.T, rung, settings, density)
 
 
-def seen_closely(solution: Solution, source: Cloud, target: Cloud, settings: Alignment) -> Solution:
+def with_final_pairs(solution: Solution, source: DeviceMixture, target: DeviceMixture, settings: Alignment) -> Solution:
     """The solution with its last rung's data seen again at the final pose, with many partners per row."""
     rung = replace(settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
     pairs = pairs_at(source, target, solution.at, rung, settings, FINAL_DENSITY)
     if pairs is None:
         return solution
-    here = beyond(solution.at, solution.at)
-    return replace(solution, pairs=pairs, data=two_way(*pairs, here), weight=settings.information * worth(rung))
+    here = relative_to(solution.at, solution.at)
+    return replace(
+        solution, pairs=pairs, data=two_way(*pairs, here), weight=settings.effective_measurements * data_weight(rung)
+    )

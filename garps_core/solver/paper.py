@@ -16,20 +16,20 @@ from scipy.spatial.transform import Rotation
 
 from garps_core.config import Alignment
 from garps_core.geometry import Array, skew
-from garps_core.objective.pairs import Cloud, pair_up, without_floor
+from garps_core.objective.pairs import DeviceMixture, pair_up, without_floor
 from garps_core.objective.shape import Pairs, evaluate
-from garps_core.objective.state import Belief, State
+from garps_core.objective.state import State, WeightedStart
 from garps_core.solver.ladder import MIN_ROWS, Solution, posterior
 
 
-def salient(cloud: Cloud, settings: Alignment) -> Cloud:
+def salient(cloud: DeviceMixture, settings: Alignment) -> DeviceMixture:
     """Components of at least the opacity threshold, then every `component_stride`-th of them."""
     kept = cloud.take(cloud.weights >= settings.opacity_threshold)
     kept = kept.take(torch.arange(0, len(kept), settings.component_stride, device=kept.means.device))
     return replace(kept, weights=kept.weights / kept.weights.sum())
 
 
-def paper_pairs(source: Cloud, target: Cloud, T: Array, settings: Alignment) -> Pairs | None:
+def paper_pairs(source: DeviceMixture, target: DeviceMixture, T: Array, settings: Alignment) -> Pairs | None:
     """The paper's candidate pairs at pose T; None when fewer than 50 components are left in a mixture."""
     x, y = salient(source, settings), salient(target, settings)
     if min(len(x), len(y)) < MIN_ROWS:
@@ -75,13 +75,13 @@ def adam_path(pairs: Pairs, T: Array, settings: Alignment, steps: int) -> list[A
     return path
 
 
-def maximise(source: Cloud, target: Cloud, known: Belief, settings: Alignment) -> list[Solution]:
+def maximise(source: DeviceMixture, target: DeviceMixture, known: WeightedStart, settings: Alignment) -> list[Solution]:
     """The paper's optimisation from the known pose; its curvature plus the prior's makes the covariance."""
     pairs = paper_pairs(source, target, known.T, settings)
     if pairs is None:
         return []
     rung = settings.ladder[0]
     at = State(adam_path(pairs, known.T, settings, rung.steps)[-1])
-    weight = settings.information * rung.covariance_scale
-    end = posterior(evaluate(pairs, at.T, "sum"), at, Belief(known.T, known.precision), weight)
+    weight = settings.effective_measurements * rung.covariance_scale
+    end = posterior(evaluate(pairs, at.T, "sum"), at, WeightedStart(known.T, known.precision), weight)
     return [Solution(at, end, rung.steps, True, weight, end.data)]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from garps_core.config import Config
-from garps_core.depth_errors import shared_sigmas
+from garps_core.depth_errors import error_sigmas
 from garps_core.errors import InitialisationError
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse
 from garps_core.start.features import Matches
@@ -78,7 +78,7 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     # both directions use the same matches: their pixel noise is one noise, counted twice in H
     covariance = 2.0 * np.linalg.inv(H) * config.start.covariance_inflation**2
     for shared in (f.from_points + A.T @ b.from_pixels, f.from_pixels + A.T @ b.from_points):  # source, target
-        effect = np.linalg.solve(H, shared) * shared_sigmas(config.lifting)
+        effect = np.linalg.solve(H, shared) * error_sigmas(config.lifting)
         covariance += effect @ effect.T
     return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.config import Config
-from garps_core.depth_errors import shared_sigmas
+from garps_core.depth_errors import error_sigmas
 from garps_core.errors import InitialisationError, InputError
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse, se3_log, transform
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
@@ -199,7 +199,7 @@ def _depth_ratio(order: _Order, k: int, T: Array) -> float | None:
 
 def _refined(T: Array, way: OneWay, scale_sigma: float, config: Config) -> tuple[Array, Array, Array]:
     """Robust Gauss-Newton; the pose, and as covariances of its left twist the noise and what all points share."""
-    sigma, shared = 1.0, shared_sigmas(config.lifting)
+    sigma, shared = 1.0, error_sigmas(config.lifting)
     shared[0] = scale_sigma
     shared[1:6] = np.maximum(shared[1:6], config.start.network_warp_sigma)
     lifting = replace(config.lifting, patch_sigma=0.0)  # that of another depth: these points were seen with both views
@@ -212,7 +212,7 @@ def _refined(T: Array, way: OneWay, scale_sigma: float, config: Config) -> tuple
     inverse = np.linalg.inv(normal.H + 1e-9 * np.eye(6))
     alike = max(1.0, float(np.trace(_spread(normal, way.px) @ inverse)) / 6)  # 1 for pixels that err by themselves
     effect = inverse @ normal.from_points * shared
-    pointing = inverse @ normal.from_pixels * shared_sigmas(config.lifting)
+    pointing = inverse @ normal.from_pixels * error_sigmas(config.lifting)
     return np.asarray(T, np.float64), np.asarray(inverse * alike, np.float64), effect @ effect.T + pointing @ pointing.T
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.config.lifting import Lifting
-from garps_core.depth_errors import depth_sigma, shared_errors
+from garps_core.depth_errors import depth_sigma, error_fields
 from garps_core.geometry import Array, point_jacobian, project, transform
 
 MIN_PIXEL_SIGMA = 0.3
@@ -48,7 +48,7 @@ class OneWay:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Reprojected:
     """A way's points under a pose, at some depth."""
 
     points: Array
@@ -63,7 +63,7 @@ class Seen:
     """(n, 2) px, at the measured depth, by the derivative at this one."""
 
 
-def seen_at_likely_depths(way: OneWay, T: Array, pixel_sigma: float, depth_sigma: Array) -> Seen:
+def reprojected(way: OneWay, T: Array, pixel_sigma: float, depth_sigma: Array) -> Reprojected:
     """The way under T where depth is off by `depth_sigma` (n,) of its logarithm; zeros leave it as measured."""
     seen = _seen(way, T, np.zeros(len(way.points)))
     if not depth_sigma.any():
@@ -76,13 +76,13 @@ def seen_at_likely_depths(way: OneWay, T: Array, pixel_sigma: float, depth_sigma
     return seen
 
 
-def _seen(way: OneWay, T: Array, change: Array) -> Seen:
+def _seen(way: OneWay, T: Array, change: Array) -> Reprojected:
     points = way.points * np.exp(change)[:, None]
     moved = transform(T, points)
     by_point = _by_point(moved, way.K)
     turned = (T[:3, :3] @ points.T).T
     along = np.asarray((by_point @ turned[..., None])[..., 0])
-    return Seen(points, moved, by_point, along, project(way.K, moved) - way.px - along * change[:, None])
+    return Reprojected(points, moved, by_point, along, project(way.K, moved) - way.px - along * change[:, None])
 
 
 def _by_point(points: Array, K: Array) -> Array:
@@ -94,7 +94,7 @@ def _by_point(points: Array, K: Array) -> Array:
     return D
 
 
-def whitened(seen: Seen, pixel_sigma: float, depth_sigma: float) -> Array:
+def whitened(seen: Reprojected, pixel_sigma: float, depth_sigma: float) -> Array:
     """Residuals (n, 2) px with the covariance s^2 1 + p^2 a a' -> with s^2 1: less of what lies along a."""
     if depth_sigma == 0:
         return seen.residual
@@ -103,7 +103,7 @@ def whitened(seen: Seen, pixel_sigma: float, depth_sigma: float) -> Array:
     return np.asarray(seen.residual - direction * (seen.residual * direction).sum(1, keepdims=True) * (1 - share))
 
 
-def across(seen: Seen) -> Array:
+def across(seen: Reprojected) -> Array:
     """(n,) px, residuals across the epipolar lines: what no depth explains."""
     direction, _ = _directions(seen.along)
     return np.asarray(seen.residual[:, 1] * direction[:, 0] - seen.residual[:, 0] * direction[:, 1])
@@ -121,7 +121,7 @@ def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 
     Where depth is off by `patch_sigma` from place to place, so many sigmas of that and of one pixel are allowed.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        seen = seen_at_likely_depths(way, T, 1.0, np.full(len(way.points), patch_sigma))
+        seen = reprojected(way, T, 1.0, np.full(len(way.points), patch_sigma))
         sigmas = whitened(seen, 1.0, patch_sigma)
     return np.asarray((seen.moved[:, 2] > 0.01) & (np.linalg.norm(sigmas, axis=-1) < threshold_px))
 
@@ -161,7 +161,7 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
     sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / READINGS_AVERAGE
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
-    seen = seen_at_likely_depths(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
+    seen = reprojected(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))
     residual, along = seen.residual, seen.along
     D = seen.by_point
     J = D @ point_jacobian(seen.moved)
@@ -170,7 +170,7 @@ def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting
     size = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", residual, W, residual), 1e-12))
     W = W * np.minimum(1.0, HUBER / size)[:, None, None]
     JW = J.transpose(0, 2, 1) @ W
-    fields = D @ (T[:3, :3] @ shared_errors(seen.points))
+    fields = D @ (T[:3, :3] @ error_fields(seen.points))
     pointing = np.zeros((2, 8))
     pointing[0, 6], pointing[1, 7] = -way.K[0, 0], -way.K[1, 1]
     scores = (JW @ residual[..., None])[..., 0]

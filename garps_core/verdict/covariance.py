@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from garps_core.config.lifting import Lifting
-from garps_core.depth_errors import DEPTH_MODES, shared_errors, shared_sigmas
+from garps_core.depth_errors import DEPTH_MODES, error_fields, error_sigmas
 from garps_core.geometry import Array, point_jacobian, ros_from_twist, se3_inverse
 from garps_core.objective.shape import Pairs, row_information
-from garps_core.objective.state import Belief, State
+from garps_core.objective.state import State, WeightedStart
 from garps_core.objective.with_depth_errors import backward_jacobian
 from garps_core.solver.ladder import Solution, curvature
 
@@ -23,7 +23,7 @@ OPEN_DIRECTION = 1e-5
 """Share of the curvature that open directions are given: a very large variance."""
 
 
-def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Array:
+def pose_covariance(solution: Solution, known: WeightedStart, lifting: Lifting) -> Array:
     """6x6 covariance (ROS meaning) at the solution.
 
     The pose's part of the inverse of (weighted observed information of the data + precision of what was known), plus
@@ -37,18 +37,18 @@ def pose_covariance(solution: Solution, known: Belief, lifting: Lifting) -> Arra
     data, weight, precision = solution.data, solution.weight, known.joint()
     covariance = np.linalg.inv(weight * curvature(data, OPEN_DIRECTION, OPEN_BELOW) + precision)
     if solution.pairs is not None:
-        sigmas = shared_sigmas(lifting)
+        sigmas = error_sigmas(lifting)
         if len(known.error_precision):
             sigmas[:DEPTH_MODES] = 0.0
         held = np.linalg.inv(weight * data.information + precision)
-        for pull in shared_pull(*solution.pairs, solution.at):
+        for pull in error_gradients(*solution.pairs, solution.at):
             effect = held @ (weight * pull) * sigmas
             covariance += effect @ effect.T
     of_pose = covariance[:6, :6]
     return ros_from_twist(0.5 * (of_pose + of_pose.T), solution.T)
 
 
-def share_of_known(solution: Solution, known: Belief) -> Array:
+def share_of_known(solution: Solution, known: WeightedStart) -> Array:
     """6x6 part of the covariance of the solution's left twist that comes from what was known of the pose: C K C.
 
     C = (D + K)^-1 without the shared errors that `pose_covariance` adds: they come from the data.
@@ -74,7 +74,7 @@ def inflated(covariance: Array, of_known: Array, factor: float) -> Array:
     return np.asarray(covariance + (factor**2 - 1) * (covariance - of_known))
 
 
-def shared_pull(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:
+def error_gradients(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:
     """What each shared error of the source's, and of the target's, points adds to the gradient of `two_way`.
 
     Partners are held, as in the Gauss-Newton information: -J' Q dd for a displacement dd of rows minus partners.
@@ -90,8 +90,8 @@ def shared_pull(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Arra
 
 def _one_way_pull(pairs: Pairs, T: Array, errors: int) -> tuple[Array, Array]:
     Q, moved = row_information(pairs, T)
-    rows = T[:3, :3] @ shared_errors(pairs.means.double().cpu().numpy())
-    partners = shared_errors(moved)
+    rows = T[:3, :3] @ error_fields(pairs.means.double().cpu().numpy())
+    partners = error_fields(moved)
     J = point_jacobian(moved)
     if errors:
         J = np.concatenate([J, rows[:, :, :DEPTH_MODES], -partners[:, :, :DEPTH_MODES]], axis=2)

@@ -10,7 +10,7 @@ import numpy as np
 from garps_core.checks import Float64Array
 from garps_core.config import Alignment
 from garps_core.geometry import displacement, se3_inverse, se3_log, twist_from_ros
-from garps_core.objective.brightness import Sharpened
+from garps_core.objective.brightness import BrightnessFit
 from garps_core.solver.ladder import Solution
 from garps_core.types import Mixture, Prior, Status
 
@@ -30,7 +30,7 @@ class Finding:
     T: Float64Array
     covariance: Float64Array
     overlap: float
-    seen: Sharpened | None
+    seen: BrightnessFit | None
 
     @property
     def merit(self) -> float:

@@ -71,7 +71,7 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class ColouredPoints:
     """Points (Nx3 float32, m) with colours (Nx3 uint8)."""
 
     points: npt.NDArray[np.float32]
@@ -92,7 +92,7 @@ class Result:
     """What became of the prior: none, used, or why not."""
     doubts: list[str] = field(default_factory=list)
     """What looks wrong about frame names; poses are computed all the same."""
-    clouds: tuple[Cloud, Cloud] | None = None
+    clouds: tuple[ColouredPoints, ColouredPoints] | None = None
     """Source and target, both in the target frame, when asked for and when there is a pose."""
     trace: str = ""
     """Of an error that nobody expected."""
@@ -228,7 +228,7 @@ class Solver:
             child_frame_id=settings.source_frame or outcome.child_frame_id,
         )
 
-    def _clouds(self, outcome: Origin | Outcome) -> tuple[Cloud, Cloud] | None:
+    def _clouds(self, outcome: Origin | Outcome) -> tuple[ColouredPoints, ColouredPoints] | None:
         """Both clouds in the frame of the outcome; with a keyframe that is not the keyframe's own."""
         if isinstance(outcome, Origin) or outcome.T is None or self._aligned is None:
             return None
@@ -237,7 +237,7 @@ class Solver:
             return None
         with self._in_stage("clouds"):
             T_frame_target = outcome.T @ se3_inverse(found.T_target_source)
-            return _cloud(mixtures[0], outcome.T), _cloud(mixtures[1], T_frame_target)
+            return _coloured_points(mixtures[0], outcome.T), _coloured_points(mixtures[1], T_frame_target)
 
     @contextmanager
     def _in_stage(self, name: str) -> Iterator[None]:
@@ -250,6 +250,6 @@ class Solver:
                 self._result.core_s += time.perf_counter() - began
 
 
-def _cloud(mixture: Mixture, T: Float64Array) -> Cloud:
+def _coloured_points(mixture: Mixture, T: Float64Array) -> ColouredPoints:
     points = mixture.means @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
-    return Cloud(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))
+    return ColouredPoints(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))

@@ -18,7 +18,7 @@ from sensor_msgs.msg import PointCloud2
 
 from garps_core.checks import Float64Array
 from garps_ros.estimates.outcomes import Outcome
-from garps_ros.live.estimator import Cloud
+from garps_ros.live.estimator import ColouredPoints
 from garps_ros.live.health import Finding
 from garps_ros.live.inputs import SIDES
 from garps_ros.live.log import Log
@@ -86,7 +86,7 @@ class Publishing:
             return "off"
         return self._transforms.send(T, stamp_ns, frame_id, outcome.child_frame_id) or "published"
 
-    def show(self, clouds: tuple[Cloud, Cloud], outcome: Outcome) -> None:
+    def show(self, clouds: tuple[ColouredPoints, ColouredPoints], outcome: Outcome) -> None:
         """Publish the source and target clouds to those that are subscribed to."""
         stamp_ns = outcome.row.source_stamp_ns
         for publisher, cloud in zip(self._clouds, clouds, strict=True):

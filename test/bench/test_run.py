@@ -89,9 +89,9 @@ def test_a_cluster_gives_the_same_rows(folder: Path, tmp_path: Path) -> None:
 
 
 def test_settings_come_from_a_file(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("alignment.information: 12.5\n")
+    (tmp_path / "mine.yaml").write_text("alignment.effective_measurements: 12.5\n")
     for depth, preset in (("sensor", "sensor"), ("demo_net", "demo_net")):
-        changes = {"reconstruction.method": "rgbd", "alignment.information": 12.5, "lifting.stride": 4}
+        changes = {"reconstruction.method": "rgbd", "alignment.effective_measurements": 12.5, "lifting.stride": 4}
         found = run.config_for(depth, tmp_path / "mine.yaml", ["lifting.stride=4"])
         assert found == Config.preset(preset).replace(changes)
 

@@ -47,7 +47,7 @@ def test_balls_have_the_volume_of_what_they_replace(pair: Pair) -> None:
 def test_only_the_finest_rung_is_left() -> None:
     config = Config.preset("monocular")
     found = last_rung(config).alignment
-    assert found.information == config.alignment.information
+    assert found.effective_measurements == config.alignment.effective_measurements
     assert found.ladder == config.alignment.ladder[-1:] and found.search_ladder == config.alignment.search_ladder[-1:]
 
 

@@ -117,7 +117,9 @@ def test_pose_from_monocular_depth():
     assert translation_error_m(estimate.T_target_source, truth) < 0.015
     assert rotation_error_deg(estimate.T_target_source, truth) < 0.25
     assert nees(estimate.T_target_source, estimate.covariance, truth) < 25
-    believed = estimate_relative_pose(source, target, Config.preset("monocular").replace({"alignment.brightness": 0.0}))
+    believed = estimate_relative_pose(
+        source, target, Config.preset("monocular").replace({"alignment.brightness_measurements": 0.0})
+    )
     assert np.trace(estimate.covariance[:3, :3]) < 0.9 * np.trace(believed.covariance[:3, :3]), "brightness sharpens"
 
 

@@ -165,7 +165,7 @@ SETTINGS = {
         lambda: Config().replace({"lifting.strid": 4}),
         "'lifting.strid' does not exist; did you mean 'lifting",
     ),
-    "no part": (lambda: Config().replace({"information": 4}), "did you mean 'alignment.information'"),
+    "no part": (lambda: Config().replace({"information": 4}), "did you mean 'alignment.effective_measurements'"),
     "nothing like it": (lambda: Config().replace({"zzzzzz": 4}), "'zzzzzz' does not exist; expected one of the names"),
     "below a leaf": (lambda: Config().replace({"seed.value": 4}), "setting 'seed.value' does not exist"),
     "below range": (
@@ -174,7 +174,10 @@ SETTINGS = {
     ),
     "above range": (lambda: Config().replace({"start.match_ratio": 1.5}), "is 1.5: expected between 0.1 and 1"),
     "NaN": (lambda: Lifting(noise_linear=float("nan")), "lifting.noise_linear is nan: expected between 0 and 1 m/m"),
-    "infinite": (lambda: Alignment(information=float("inf")), "alignment.information is inf: expected between"),
+    "infinite": (
+        lambda: Alignment(effective_measurements=float("inf")),
+        "alignment.effective_measurements is inf: expected between",
+    ),
     "float for integer": (lambda: Lifting(stride=2.0), "lifting.stride is 2.0: expected an integer"),
     "text for number": (lambda: Lifting(noise_linear="1"), "lifting.noise_linear is '1': expected a number"),
     "flag for number": (lambda: Config(seed=True), "config.seed is True: expected an integer"),

@@ -21,7 +21,7 @@ def written(tmp_path: Path, text: str) -> Path:
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     changes = {
-        "alignment.information": 6.1,
+        "alignment.effective_measurements": 6.1,
         "lifting.noise_floor_m": 1e-05,
         "start.features": False,
         "lifting.stride": 4,
@@ -35,16 +35,16 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 @given(value=st.floats(1e-3, 1e6), tiny=st.floats(0, 1))
 def test_numbers_keep_every_digit(tmp_path_factory: pytest.TempPathFactory, value: float, tiny: float) -> None:
     path = tmp_path_factory.getbasetemp() / "numbers.yaml"
-    write_settings(path, "default", {"alignment.information": value, "lifting.noise_floor_m": tiny})
+    write_settings(path, "default", {"alignment.effective_measurements": value, "lifting.noise_floor_m": tiny})
     found = read_settings(path)
-    assert (found.alignment.information, found.lifting.noise_floor_m) == (value, tiny)
+    assert (found.alignment.effective_measurements, found.lifting.noise_floor_m) == (value, tiny)
 
 
 def test_plain_and_nested_files(tmp_path: Path) -> None:
     base = Config.preset("monocular")
-    plain = read_settings(written(tmp_path, "lifting.stride: 4\nalignment.information: 7\n"), base)
+    plain = read_settings(written(tmp_path, "lifting.stride: 4\nalignment.effective_measurements: 7\n"), base)
     nested = read_settings(written(tmp_path, "lifting: {stride: 4}\nalignment:\n  information: 7\n"), base)
-    assert plain == nested == base.replace({"lifting.stride": 4, "alignment.information": 7})
+    assert plain == nested == base.replace({"lifting.stride": 4, "alignment.effective_measurements": 7})
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,8 @@ def test_the_node_takes_the_same(tmp_path: Path) -> None:
     """The names of a written file are parameters of the node, of the types that it wants."""
     from garps_ros.parameters.parameter import parameters, settings_from
 
-    write_settings(tmp_path / "a.yaml", "monocular", {"alignment.information": 6.0, "lifting.stride": 4})
+    write_settings(tmp_path / "a.yaml", "monocular", {"alignment.effective_measurements": 6.0, "lifting.stride": 4})
     found = read_settings(tmp_path / "a.yaml")
     values = {parameter.name: parameter.default for parameter in parameters("monocular")}
-    _, config = settings_from(values | {"alignment.information": 6.0, "lifting.stride": 4})
+    _, config = settings_from(values | {"alignment.effective_measurements": 6.0, "lifting.stride": 4})
     assert config == found and "monocular" in PRESETS

@@ -14,7 +14,7 @@ from garps_core.depth_errors import depth_sigma
 from garps_core.geometry import pixel_rays, project
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import FRUSTUM_STEP_PX
-from garps_core.objective.pairs import to_cloud, visible
+from garps_core.objective.pairs import to_device, visible
 
 UNSMOOTHED = Config().replace({"lifting.smoothing_px": 0})
 VIEW = look()
@@ -242,7 +242,7 @@ def test_the_frustum_s_depth_map_lies_where_its_intrinsics_say(size):
 @pytest.mark.parametrize("size", [(120, 160), (121, 163)])
 def test_a_camera_sees_what_it_saw_and_nothing_behind_it(size):
     mixture = reconstruct(look(size=size))
-    cloud = to_cloud(mixture, Config())
+    cloud = to_device(mixture, Config())
     assert visible(cloud, np.eye(4), mixture.frustum, 0.1).double().mean() > 0.98
     assert not visible(cloud, np.diag([-1.0, 1, -1, 1]), mixture.frustum, 0.1).any()
     nearer = np.eye(4)

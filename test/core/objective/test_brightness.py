@@ -9,13 +9,13 @@ import pytest
 from surfaces import TRUTH, K, flat, grey_at, look, off, room
 
 from garps_core import Config
-from garps_core.depth_errors import shared_sigmas
+from garps_core.depth_errors import error_sigmas
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
 from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import brightness_of
 from garps_core.objective import brightness
-from garps_core.objective.brightness import sharpen
+from garps_core.objective.brightness import fit_brightness
 
 SCENE = {"camera": np.diag([2, 2, 1]) @ K, "size": (240, 320)}
 NEAR = np.diag([0.03**2] * 3 + [np.radians(0.6) ** 2] * 3)
@@ -56,7 +56,7 @@ def scene(request, views):
 
 
 def sharpened(source, target, T, covariance=NEAR, information=1.0, sigmas=NOTHING_SHARED):
-    found = sharpen(source, target, T, covariance, information, sigmas)
+    found = fit_brightness(source, target, T, covariance, information, sigmas)
     assert found is not None
     return found
 
@@ -163,10 +163,10 @@ def test_there_is_nothing_to_say_without_brightness_texture_or_common_sight(view
     away[:3, :3] = np.diag([-1.0, 1, -1]) @ TRUTH[:3, :3]
     for information in (1.0, 0.0):
         for pair in ((blank, blank), (source, blank), (blank, target), (source, unknown), (unknown, target)):
-            assert sharpen(*pair, TRUTH, NEAR, information, NOTHING_SHARED) is None
-        assert sharpen(source, target, away, NEAR, information, NOTHING_SHARED) is None
+            assert fit_brightness(*pair, TRUTH, NEAR, information, NOTHING_SHARED) is None
+        assert fit_brightness(source, target, away, NEAR, information, NOTHING_SHARED) is None
     holes = replace(source, depth=np.full_like(source.depth, np.nan))
-    assert sharpen(holes, target, TRUTH, NEAR, 1.0, NOTHING_SHARED) is None
+    assert fit_brightness(holes, target, TRUTH, NEAR, 1.0, NOTHING_SHARED) is None
 
 
 def test_without_information_it_only_compares(scene):
@@ -203,7 +203,7 @@ def test_swapped_views_give_the_inverse(scene):
 
 def test_shared_depth_errors_make_it_less_certain(views):
     exact = sharpened(*views, TRUTH)
-    sigmas = shared_sigmas(Config.preset("monocular").lifting)
+    sigmas = error_sigmas(Config.preset("monocular").lifting)
     honest = sharpened(*views, TRUTH, sigmas=sigmas)
     gained = np.linalg.eigvalsh(honest.covariance - exact.covariance)
     assert gained[0] > -1e-3 * gained[-1] and np.trace(honest.covariance) > 4 * np.trace(exact.covariance)

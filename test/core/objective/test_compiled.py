@@ -18,7 +18,7 @@ from surfaces import HALF, TRUTH, disturbed, off, random_mixture, random_pose, t
 from garps_core import Config, align_mixtures
 from garps_core.config import Alignment, Rung
 from garps_core.objective import compiled, neighbours, pairs, shape
-from garps_core.objective.pairs import image_coordinates, pair_up, to_cloud, visible
+from garps_core.objective.pairs import image_coordinates, pair_up, to_device, visible
 
 needs_numba = pytest.mark.skipif(not compiled.AVAILABLE, reason="numba is not installed")
 CLOSE = 1e-5
@@ -31,8 +31,10 @@ def clouds(kind, config=None):
     """Rows, partners and the pose between them; a number of rows that is no multiple of a block's 128."""
     if kind == "surface":
         rows, partners = two_mixtures()
-        return to_cloud(rows, config or Config()), to_cloud(partners, config or Config()), TRUTH
-    rows, partners = (to_cloud(random_mixture(seed, count), config or Config()) for seed, count in ((1, 700), (2, 900)))
+        return to_device(rows, config or Config()), to_device(partners, config or Config()), TRUTH
+    rows, partners = (
+        to_device(random_mixture(seed, count), config or Config()) for seed, count in ((1, 700), (2, 900))
+    )
     return rows, partners, random_pose(3, 0.1)
 
 
@@ -138,7 +140,7 @@ def test_what_a_camera_sees_is_what_torch_says(monkeypatch, ratio):
     holes = target.frustum.depth.copy()
     holes[5:9, 10:20] = np.nan
     frustum = replace(target.frustum, depth=holes)
-    cloud = to_cloud(source, Config())
+    cloud = to_device(source, Config())
     turned = np.diag([-1.0, 1, -1, 1])
     for T in (TRUTH, np.eye(4), random_pose(1, 0.4), random_pose(2, 0.4), turned):
         fast, slow = both(monkeypatch, lambda T=T: visible(cloud, T, frustum, ratio).numpy())

@@ -17,7 +17,7 @@ from garps_core import Config
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import adjoint, se3_exp, se3_inverse
 from garps_core.objective import shape
-from garps_core.objective.pairs import pair_up, to_cloud, without_floor
+from garps_core.objective.pairs import pair_up, to_device, without_floor
 from garps_core.objective.shape import evaluate
 from garps_core.objective.state import State
 from garps_core.solver.ladder import two_way
@@ -33,7 +33,7 @@ SEEDS = st.integers(0, 10**6)
 def all_pairs(rows=ROWS, partners=PARTNERS, T=POSE, scale=2.0, config=DOUBLE, alignment=SETTINGS, k=None, form="log"):
     """The package's pairs, by default every row with every partner; "sum" has no outlier floor."""
     rung = Rung(scale, 1000, k or len(partners), 1)
-    pairs = pair_up(to_cloud(rows, config), to_cloud(partners, config), T, rung, alignment)
+    pairs = pair_up(to_device(rows, config), to_device(partners, config), T, rung, alignment)
     return without_floor(pairs) if form == "sum" else pairs
 
 

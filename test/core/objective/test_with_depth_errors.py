@@ -14,10 +14,10 @@ from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture
 from garps_core import Config, Prior, Status, align_mixtures
 from garps_core.align import _known
 from garps_core.config import Alignment, Rung
-from garps_core.depth_errors import depth_modes, shared_errors
+from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
 from garps_core.mixtures import reconstruct
-from garps_core.objective.pairs import pair_up, to_cloud
+from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information
 from garps_core.objective.state import State
 from garps_core.objective.with_depth_errors import MODES, backward_jacobian, corrected, evaluate_at, evaluate_jointly
@@ -26,7 +26,7 @@ from garps_core.solver.ladder import two_way
 
 DOUBLE = Config(dtype="float64")
 MONOCULAR = Config.preset("monocular")
-BY_SHAPE = MONOCULAR.replace({"alignment.brightness": 0.0})
+BY_SHAPE = MONOCULAR.replace({"alignment.brightness_measurements": 0.0})
 SETTINGS = Alignment(outlier_floor=0.05, max_distance_m=2.0)
 LOOSE = disturbed(covariance=100 * FREE)
 POSE = random_pose(3, 0.1)
@@ -35,7 +35,7 @@ SEEDS = st.integers(0, 10**6)
 
 
 def pairs_of(rows_seed=1, partners_seed=2, T=POSE):
-    rows, partners = (to_cloud(random_mixture(seed, 60), DOUBLE) for seed in (rows_seed, partners_seed))
+    rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (rows_seed, partners_seed))
     return pair_up(rows, partners, T, Rung(2.0, 1000, 9, 1), SETTINGS)
 
 
@@ -95,9 +95,9 @@ def test_information_is_the_sum_over_rows_of_what_each_measures():
     """J' Q J written out, J = [I, -[mu']x, (R p) phi, -mu' psi]."""
     Q, mu = row_information(FORWARD, POSE)
     own = FORWARD.means.numpy()
-    rows = POSE[:3, :3] @ shared_errors(own)[:, :, :MODES]
+    rows = POSE[:3, :3] @ error_fields(own)[:, :, :MODES]
     turn = np.stack([np.cross(axis, mu) for axis in np.eye(3)], axis=2)
-    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), turn, rows, -shared_errors(mu)[:, :, :MODES]], axis=2)
+    J = np.concatenate([np.broadcast_to(np.eye(3), Q.shape), turn, rows, -error_fields(mu)[:, :, :MODES]], axis=2)
     expected = (J.transpose(0, 2, 1) @ Q @ J).sum(0)
     got = evaluate_jointly(FORWARD, POSE, NONE, NONE).information
     np.testing.assert_allclose(got, expected, atol=1e-10 * np.abs(expected).max())
@@ -133,7 +133,7 @@ def test_backward_jacobian_is_the_derivative_of_swapping(errors):
 
 
 def test_corrected_points_stay_on_their_rays():
-    cloud = to_cloud(random_mixture(4, 100), DOUBLE)
+    cloud = to_device(random_mixture(4, 100), DOUBLE)
     errors = drawn(4, 0.03)[:MODES]
     there = corrected(cloud, errors)
     gain = there.means / cloud.means
@@ -143,13 +143,13 @@ def test_corrected_points_stay_on_their_rays():
     np.testing.assert_allclose(gain[:, 2], expected, rtol=1e-12)
     assert gain.std() > 0.01
     assert there.covariances is cloud.covariances and corrected(cloud, np.zeros(0)) is cloud
-    single = to_cloud(random_mixture(4, 100), Config())
+    single = to_device(random_mixture(4, 100), Config())
     assert corrected(single, errors).means.dtype == torch.float32
 
 
 def test_correcting_the_clouds_is_evaluating_with_the_errors():
     """Of the rows to the last digit: what the solver does between its rungs changes nothing."""
-    rows, partners = (to_cloud(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
+    rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
     errors, rung, far = drawn(6, 0.03)[:MODES], Rung(2.0, 1000, 60, 1), replace(SETTINGS, max_distance_m=100.0)
     of_corrected = pair_up(corrected(rows, errors), partners, POSE, rung, far)
     plain = pair_up(rows, partners, POSE, rung, far)
@@ -170,7 +170,7 @@ def wrong_in_scale(gains=(1.03, 0.99), shapes=(0.0, 0.0)):
 
 
 def solved(mixtures, config, prior):
-    x, y = (to_cloud(mixture, config) for mixture in mixtures)
+    x, y = (to_device(mixture, config) for mixture in mixtures)
     (solution,) = ladder.anneal(x, y, _known(prior, config), config.alignment)
     return solution
 

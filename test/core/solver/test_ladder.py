@@ -13,8 +13,8 @@ from surfaces import DISTURBANCE, FREE, TRUTH, disturbed, flat, grey_at, moved, 
 from garps_core import Config, Prior, Status, align_mixtures
 from garps_core.config import Rung
 from garps_core.geometry import adjoint, inverted, ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
-from garps_core.objective.pairs import overlap, to_cloud, visible
-from garps_core.objective.state import Belief, State
+from garps_core.objective.pairs import overlap, to_device, visible
+from garps_core.objective.state import State, WeightedStart
 from garps_core.solver import ladder
 
 DOUBLE = Config(dtype="float64")
@@ -38,7 +38,7 @@ def small():
 @pytest.fixture(scope="module")
 def rung(views):
     """Both directions' pairs of the last rung at the disturbed start, and the start's twist covariance."""
-    x, y = (to_cloud(mixture, DOUBLE) for mixture in views)
+    x, y = (to_device(mixture, DOUBLE) for mixture in views)
     start = disturbed(twist=0.2 * DISTURBANCE).T_target_source
     return *ladder.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment, density=1.0), start
 
@@ -188,11 +188,11 @@ def test_a_climb_never_goes_downhill(rung, seed):
 
     def function(at):
         seen.append(
-            ladder.posterior(ladder.two_way(forward, backward, at), at, Belief(start, np.linalg.inv(FREE)), 60.0)
+            ladder.posterior(ladder.two_way(forward, backward, at), at, WeightedStart(start, np.linalg.inv(FREE)), 60.0)
         )
         return seen[-1]
 
-    end = ladder.climb(function, State(start), 8, 1e-3)
+    end = ladder.ascend(function, State(start), 8, 1e-3)
     values = [there.value for there in seen]
     assert end.posterior.value == max(values) >= values[0]
     assert len(seen) == end.iterations + 1 and (end.converged or end.iterations == 8)
@@ -205,7 +205,7 @@ def test_a_climb_keeps_what_it_has_where_every_step_fails():
         r = se3_log(at.T)
         return ladder.Posterior(-float(r @ r), np.ones(6), np.eye(6), None)
 
-    end = ladder.climb(function, State(np.eye(4)), 12, 1e-6)
+    end = ladder.ascend(function, State(np.eye(4)), 12, 1e-6)
     np.testing.assert_array_equal(end.at.T, np.eye(4))
     assert 2 < end.iterations <= 12
 
@@ -221,7 +221,9 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 
     def at(twist):
         there = State(se3_exp(np.asarray(twist)) @ T)
-        return ladder.posterior(ladder.two_way(forward, backward, there), there, Belief(T_prior, precision), 60.0)
+        return ladder.posterior(
+            ladder.two_way(forward, backward, there), there, WeightedStart(T_prior, precision), 60.0
+        )
 
     numeric = [(at(1e-5 * e).value - at(-1e-5 * e).value) / 2e-5 for e in np.eye(6)]
     gradient = at(np.zeros(6)).gradient
@@ -231,8 +233,8 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 def test_information_of_the_posterior_is_the_data_s_plus_the_prior_s(rung):
     forward, backward, T = rung
     data = ladder.two_way(forward, backward, State(T))
-    alone = ladder.posterior(data, State(T), Belief(T, np.zeros((6, 6))), 60.0)
-    both = ladder.posterior(data, State(T), Belief(T, np.linalg.inv(FREE)), 60.0)
+    alone = ladder.posterior(data, State(T), WeightedStart(T, np.zeros((6, 6))), 60.0)
+    both = ladder.posterior(data, State(T), WeightedStart(T, np.linalg.inv(FREE)), 60.0)
     np.testing.assert_allclose(alone.information, 60 * ladder.curvature(data))
     np.testing.assert_allclose(both.information - alone.information, np.linalg.inv(FREE), atol=1e-6)
 
@@ -270,7 +272,7 @@ def test_displacement_is_that_of_points_moved_at_random():
 
 
 def test_a_precise_start_skips_the_wide_rungs(views):
-    source = to_cloud(views[0], Config())
+    source = to_device(views[0], Config())
     entries = [ladder.entry(source, TRUTH, scale * FREE, LADDER) for scale in np.geomspace(1e3, 1e-4, 60)]
     assert entries == sorted(entries) and set(entries) == set(range(len(LADDER)))
     assert ladder.entry(source, TRUTH, 1e4 * FREE, LADDER) == 0
@@ -287,7 +289,7 @@ def test_the_last_rung_alone_does_not_find_the_way(views):
 
 
 def test_a_camera_sees_its_own_components_and_none_behind_it(views):
-    cloud = to_cloud(views[0], DOUBLE)
+    cloud = to_device(views[0], DOUBLE)
     frustum, turned = views[0].frustum, np.diag([1.0, -1, -1, 1])
     assert visible(cloud, np.eye(4), frustum, 0.1).double().mean() > 0.97
     assert not visible(cloud, turned, frustum, 0.1).any()

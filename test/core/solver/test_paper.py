@@ -15,7 +15,7 @@ from surfaces import FREE, random_pose
 from bench.peers.autograd import PlainObjective, rotation
 from garps_core import Config, Mixture, Prior, Status, align_mixtures
 from garps_core.geometry import se3_inverse, transform
-from garps_core.objective.pairs import to_cloud
+from garps_core.objective.pairs import to_device
 from garps_core.solver import paper
 
 STEPS = 25
@@ -91,7 +91,7 @@ def published():
 
 @pytest.fixture(scope="module")
 def pairs():
-    return paper.paper_pairs(to_cloud(SOURCE, PAPER), to_cloud(TARGET, PAPER), START, PAPER.alignment)
+    return paper.paper_pairs(to_device(SOURCE, PAPER), to_device(TARGET, PAPER), START, PAPER.alignment)
 
 
 def test_the_numbers_are_the_published_ones():
@@ -154,7 +154,7 @@ def test_neighbours_leave_out_only_what_is_small(published):
 
 
 def test_the_threshold_counts_before_the_stride():
-    chosen = paper.salient(to_cloud(SOURCE, PAPER), PAPER.alignment)
+    chosen = paper.salient(to_device(SOURCE, PAPER), PAPER.alignment)
     kept = np.flatnonzero(SOURCE.weights >= 0.5)[::32]
     np.testing.assert_array_equal(chosen.means.numpy(), SOURCE.means[kept])
     assert chosen.weights.sum().item() == pytest.approx(1)
@@ -168,7 +168,7 @@ def test_too_few_salient_components_are_no_pose_and_say_so():
 
 
 def test_without_labels_every_pair_counts_in_full(pairs):
-    plain = [to_cloud(replace(mixture, labels=None), PAPER) for mixture in (SOURCE, TARGET)]
+    plain = [to_device(replace(mixture, labels=None), PAPER) for mixture in (SOURCE, TARGET)]
     more = paper.paper_pairs(*plain, START, PAPER.alignment)
     gain = (more.log_weights - pairs.log_weights)[torch.isfinite(pairs.log_weights)].numpy()
     same = np.abs(gain) < 1e-12

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a guess: beginnings all around it, the right one found by shape alone, and no pose where there is none."""
+"""From a guess: starting_poses all around it, the right one found by shape alone, and no pose where there is none."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixture
 from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.mixtures import reconstruct
-from garps_core.objective.pairs import to_cloud
-from garps_core.objective.state import Belief
+from garps_core.objective.pairs import to_device
+from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, search
 from garps_core.start.initialise import identity
 
@@ -26,13 +26,13 @@ def grey(view):
 
 
 def belief(sigma_rad, T):
-    return Belief(T, np.linalg.inv(np.diag([0.3**2] * 3 + [sigma_rad**2] * 3)))
+    return WeightedStart(T, np.linalg.inv(np.diag([0.3**2] * 3 + [sigma_rad**2] * 3)))
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.2])
 def test_beginnings_surround_the_guess_which_is_the_first(sigma):
     T = random_pose(1, 0.5)
-    poses = search.beginnings(belief(sigma, T), search.RINGS)
+    poses = search.starting_poses(belief(sigma, T), search.RINGS)
     assert poses[0] is T and 9 <= len(poses) <= 40
     turns = np.array([Rotation.from_matrix((pose @ se3_inverse(T))[:3, :3]).as_rotvec() for pose in poses[1:]])
     sizes = np.linalg.norm(turns, axis=1) / sigma
@@ -74,7 +74,7 @@ def test_views_of_different_rooms_have_no_converged_pose(rooms):
 
 def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeypatch):
     source, target, truth = room(1, 4)
-    x, y = (to_cloud(reconstruct(view), Config()) for view in (source, target))
+    x, y = (to_device(reconstruct(view), Config()) for view in (source, target))
     settings, asked = Config().alignment, []
     by_shape = search._by_shape
     monkeypatch.setattr(search, "_by_shape", lambda *given: asked.append(1) or by_shape(*given))
@@ -104,7 +104,7 @@ def test_a_convincing_solution_ends_the_search(monkeypatch):
 
     monkeypatch.setattr(align, "search", counted)
     for enough in (-1.0, 1.0):
-        config = Config().replace({"alignment.enough_correlation": enough, "alignment.brightness": 0.05})
+        config = Config().replace({"alignment.enough_correlation": enough, "alignment.brightness_measurements": 0.05})
         estimate = align_mixtures(*mixtures, start, config)
         assert (estimate.agreement > 0) and estimate.initial is start
     assert followed[-1.0] == 1 < followed[1.0]

@@ -21,7 +21,7 @@ from garps_core.start.reprojection import (
     Seen,
     across,
     inliers_of,
-    seen_at_likely_depths,
+    reprojected,
     whitened,
 )
 
@@ -50,7 +50,7 @@ def seen_with(along, residual):
 
 
 def as_measured(way, T):
-    return seen_at_likely_depths(way, T, 1.0, np.zeros(len(way.points)))
+    return reprojected(way, T, 1.0, np.zeros(len(way.points)))
 
 
 def rotation_errors(patch_sigma: float, noise: float, seeds=range(20)) -> float:
@@ -120,7 +120,7 @@ def test_the_likely_depth_is_where_both_costs_are_smallest(truth):
     matches = exact_matches(5, count=20, pixel_noise=2.0, relative_depth_noise=OFF, truth=truth)
     points = matches.source_points * np.where(np.arange(20) == 7, 20.0, 1.0)[:, None]
     way, s = OneWay(points, matches.target_px, CAMERA), 1.5
-    seen = seen_at_likely_depths(way, truth, s, np.full(20, OFF))
+    seen = reprojected(way, truth, s, np.full(20, OFF))
     found = np.log(seen.points[:, 2] / way.points[:, 2])
     tried = np.linspace(-3 * OFF, 3 * OFF, 4001)
     pixels = np.stack([project(CAMERA, transform(truth, way.points * np.exp(d))) for d in tried])

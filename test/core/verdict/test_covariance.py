@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, look, off, random_pose, two_views
 
 from garps_core import Config, Mixture, Prior, align_mixtures
-from garps_core.depth_errors import FIELD_SLOPE, depth_sigma, shared_errors, shared_sigmas
+from garps_core.depth_errors import FIELD_SLOPE, depth_sigma, error_fields, error_sigmas
 from garps_core.geometry import inverted, ros_from_twist, se3_exp, se3_inverse, twist_from_ros
 from garps_core.metrics import pose_error
 from garps_core.mixtures import reconstruct
@@ -118,10 +118,10 @@ def test_covariance_is_symmetric_and_positive_definite(plain):
 def test_more_information_means_less_uncertainty(plain):
     """Without the errors that a whole depth map shares: those do not shrink with the number of measurements."""
     own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
-    exact, more = (estimated(Config().replace({**own, "alignment.information": i})) for i in (30.0, 3000.0))
+    exact, more = (estimated(Config().replace({**own, "alignment.effective_measurements": i})) for i in (30.0, 3000.0))
     assert (sigmas(more) < 0.2 * sigmas(exact)).all() and (sigmas(more) > 0.05 * sigmas(exact)).all()
     assert (sigmas(exact) < sigmas(plain) * (1 + 1e-6)).all()
-    much = estimated(Config().replace({"alignment.information": 3000.0}))
+    much = estimated(Config().replace({"alignment.effective_measurements": 3000.0}))
     assert (sigmas(much) > sigmas(more)).all(), "the shared errors stay"
 
 
@@ -135,7 +135,7 @@ def test_a_shared_depth_error_makes_the_pose_uncertain(plain, name):
 
 def test_a_scale_error_moves_the_camera_along_its_view():
     """Both views look along z at a surface 2.5 m away: 5 per cent of that, in either view, is a shift in z."""
-    own = {"alignment.information": 1e5, "lifting.warp_sigma": 0.0}
+    own = {"alignment.effective_measurements": 1e5, "lifting.warp_sigma": 0.0}
     small, large = (estimated(Config().replace({**own, "lifting.scale_sigma": s})) for s in (1e-4, 0.05))
     gained = large.covariance - small.covariance
     assert np.sqrt(gained[2, 2]) == pytest.approx(np.sqrt(2) * 0.05 * 2.5, rel=0.2)
@@ -207,15 +207,15 @@ def noisy(view, config, rng):
     lifting = config.lifting
     v, u = np.mgrid[: view.depth.shape[0], : view.depth.shape[1]].astype(float)
     slopes = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
-    drawn_modes = rng.normal(size=8) * shared_sigmas(lifting)
-    shared = shared_errors(slopes.reshape(-1, 3))[:, 2] @ drawn_modes  # along z: the pointing is left out
+    drawn_modes = rng.normal(size=8) * error_sigmas(lifting)
+    shared = error_fields(slopes.reshape(-1, 3))[:, 2] @ drawn_modes  # along z: the pointing is left out
     white = rng.normal(size=view.depth.shape) * depth_sigma(view.depth, lifting)
     return replace(view, depth=(view.depth * (1 + shared.reshape(view.depth.shape)) + white).astype(np.float32))
 
 
 def test_shared_errors_are_depth_polynomials_of_the_slope_and_two_turns():
     points = np.array([[0, 0, 2], [FIELD_SLOPE, -FIELD_SLOPE, 1]]) * 1.5
-    fields = shared_errors(points)
+    fields = error_fields(points)
     np.testing.assert_allclose(fields[:, 2, :6] / points[:, 2:], [[1, 0, 0, 0, 0, 0], [1, 1, -1, 1, -1, 1]])
     np.testing.assert_allclose(fields[1, :, 1], points[1])  # along the ray
     np.testing.assert_allclose(fields[:, :, 6:], [[[3, 0], [0, 3], [0, 0]], [[1.5, 0], [0, 1.5], [0, 0]]])

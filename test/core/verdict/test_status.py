@@ -10,7 +10,7 @@ from surfaces import TRUTH, disturbed, look, off, room
 from garps_core import Config, Mixture, Prior, Status, estimate_relative_pose
 from garps_core.config import Alignment
 from garps_core.geometry import ros_from_twist, se3_exp
-from garps_core.objective.brightness import Sharpened
+from garps_core.objective.brightness import BrightnessFit
 from garps_core.objective.shape import Evaluation
 from garps_core.solver.ladder import Solution, State
 from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
@@ -24,7 +24,7 @@ START = Prior(np.eye(4), WIDE, "identity")
 def finding(T=TRUTH, support=0.95, correlation=0.95, share=0.8, converged=True, covariance=SMALL, overlap=0.8):
     """A solution that is fine unless told otherwise; correlation None = brightness is not known."""
     data = Evaluation(3.0, np.zeros(6), np.eye(6), np.eye(6), support)
-    seen = None if correlation is None else Sharpened(T, covariance, correlation, share)
+    seen = None if correlation is None else BrightnessFit(T, covariance, correlation, share)
     return Finding(Solution(State(T), None, 17, converged, 60.0, data), T, covariance, overlap, seen)
 
 
