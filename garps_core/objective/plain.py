@@ -9,6 +9,7 @@ from torch import Tensor
 
 from garps_core.geometry import Array
 from garps_core.objective.packed import SYMMETRIC, moved_rows
+from garps_core.objective.visibility import surface_at
 
 CHUNK_PAIRS = 1 << 15
 """Pairs handled at a time: sixteen float32 planes of this size stay in a CPU core's second-level cache."""
@@ -131,12 +132,7 @@ def gathered(
 
 def visible(points: Tensor, R: Tensor, t: Tensor, K: Tensor, depth: Tensor, ratio: float) -> Tensor:
     """Project all points at once."""
-    height, width = depth.shape
     p = points @ R.T + t
-    z = p[:, 2].clamp_min(1e-6)
-    u = (p[:, 0] / z * K[0, 0] + K[0, 2]).round().clamp(-1, width).long()
-    v = (p[:, 1] / z * K[1, 1] + K[1, 2]).round().clamp(-1, height).long()
-    inside = (p[:, 2] > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    seen = depth[v.clamp(0, height - 1), u.clamp(0, width - 1)]
-    hidden = p[:, 2] > seen * (1 + ratio)  # False where the depth is NaN: unknown is not hidden
+    _, inside, surface = surface_at(p, K, depth)
+    hidden = p[:, 2] > surface * (1 + ratio)  # False where the depth is NaN: unknown is not hidden
     return inside & ~hidden
