@@ -310,8 +310,8 @@ def test_stage_and_times_are_those_of_the_work(monkeypatch):
         return recordings.estimate(source, target, bad=(3,))
 
     answering(monkeypatch, estimate)
-    cloud = estimator._cloud
-    monkeypatch.setattr(estimator, "_cloud", lambda *given: (stages.append(by.stage), cloud(*given))[1])
+    cloud = estimator._coloured_points
+    monkeypatch.setattr(estimator, "_coloured_points", lambda *given: (stages.append(by.stage), cloud(*given))[1])
     by = Solver(lambda _: stages.append(by.stage))
     assert by.stage == ""
     began = time.monotonic()
@@ -363,11 +363,11 @@ def test_with_a_keyframe_both_clouds_lie_in_the_frame_of_the_first(monkeypatch):
 
 def test_clouds_are_made_when_asked_for_and_when_there_is_a_pose(monkeypatch, calls):
     assert solve(*pair()).clouds is None and solve(*pair(), clouds=True).clouds is not None
-    cloud = estimator._cloud
-    monkeypatch.setattr(estimator, "_cloud", None)  # would be an error that nobody expected
+    cloud = estimator._coloured_points
+    monkeypatch.setattr(estimator, "_coloured_points", None)  # would be an error that nobody expected
     broken = solve(*pair(), clouds=True)
     assert broken.clouds is None and "TypeError" in broken.trace and broken.outcomes[0].T is not None
-    monkeypatch.setattr(estimator, "_cloud", cloud)
+    monkeypatch.setattr(estimator, "_coloured_points", cloud)
     answering(monkeypatch, lambda *_: PoseEstimate(Status.POOR_FIT, "no", moved(0.1), COVARIANCE))
     bad = solve(*pair(), clouds=True)
     assert (bad.clouds, bad.trace, bad.outcomes[0].row.status) == (None, "", "poor_fit")

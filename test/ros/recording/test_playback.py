@@ -287,7 +287,7 @@ def test_only_playing_changes_how_the_process_ends(step, frozen):
     """The one registered first is called last."""
     code = (
         "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count() > 0))\n"
-        f"from pathlib import Path; from garps_ros import playback; {step}"
+        f"from pathlib import Path; from garps_ros.recording import playback; {step}"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert done.stdout.strip() == str(frozen), done.stderr
