@@ -14,9 +14,8 @@ from small_mask2former import ADAPTER, HEAD, random_state
 from garps_core import Config, Prior, align_mixtures, metrics
 from garps_core.cli import command
 from garps_core.geometry import se3_exp
-from garps_core.mixtures import reconstruct
 from garps_core.mixtures.flash3d import labels_of, predict_gaussians
-from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, with_depth
+from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, reconstruct, with_depth
 from garps_core.mixtures.splat_writer import write_splats
 from garps_core.models import depth_anything, in_use
 from garps_core.models.flash3d import PADDED

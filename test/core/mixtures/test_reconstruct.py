@@ -17,8 +17,7 @@ from network_weights import DEPTH, install, pair, passes, tensors
 from garps_core import Config, Status, View, estimate_relative_pose
 from garps_core.cli import command
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.mixtures import reconstruct
-from garps_core.mixtures.reconstruct import with_depth
+from garps_core.mixtures.reconstruct import reconstruct, with_depth
 from garps_core.models import depth_anything, in_use
 from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of
 from garps_core.weights.manifest import BY_NAME
