@@ -17,6 +17,7 @@ from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_depth
+from garps_core.models.in_use import Networks
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import DeviceMixture, overlap, to_device
 from garps_core.objective.state import WeightedStart
@@ -33,6 +34,9 @@ SEARCHED_SIGMAS = 3.0
 
 CENTRING = 0.01
 """Sigma of a principal point that is taken to lie in the image's middle, over the image's longer side."""
+
+NETWORKS = Networks()
+"""Networks that all estimates of this process share."""
 
 
 def estimate_relative_pose(
@@ -81,11 +85,11 @@ def _estimated(
     checked_device(config.device)
     spent, begin = {}, time.perf_counter()
     try:
-        views = with_depth((source, target), config)
+        views = with_depth((source, target), config, NETWORKS)
         if views != [source, target]:  # only a network takes time
             spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
         config = _doubting(config, *views)
-        x, y = mixtures_of(views, config)
+        x, y = mixtures_of(views, config, NETWORKS)
     except (ModelError, ReconstructionError) as failure:
         of_pair = config.reconstruction.method == "two_view"
         if isinstance(failure, WeightsError) or (isinstance(failure, ReconstructionError) and not of_pair):
@@ -93,7 +97,7 @@ def _estimated(
         return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
     spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
     try:
-        starts = initialise(views[0], views[1], config, prior)
+        starts = initialise(views[0], views[1], config, prior, NETWORKS)
     except InitialisationError as failure:
         spent["initialise"] = time.perf_counter() - begin
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)

@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from garps_core import __version__
-from garps_core.align import align_mixtures, estimate_with_mixtures
+from garps_core.align import NETWORKS, align_mixtures, estimate_with_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.cli.image_files import read_image, read_view
 from garps_core.cli.report import as_json, as_text
@@ -225,7 +225,7 @@ def _uncalibrated(
         )
     if config.reconstruction.method == "two_view":
         check_settings(config)
-    K_source, K_target = estimate_intrinsics(read_image(files[0]), read_image(files[1]), config)
+    K_source, K_target = estimate_intrinsics(read_image(files[0]), read_image(files[1]), config, NETWORKS)
     source, target = (
         read_view(*given, scale, K_estimated=True) for given in zip(files, (K_source, K_target), depths, strict=True)
     )

@@ -12,6 +12,7 @@ pixel's ray; it answers with depth over focal length, since that is what a pictu
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from importlib.resources import as_file, files
 
@@ -43,6 +44,8 @@ FILE = "demo_net.safetensors"
 MAX_BYTES = 6_000_000
 MAX_ASPECT = 3
 """Of a picture's sides: beyond, nothing like it was ever seen in training."""
+
+LOG = logging.getLogger("garps_core")
 
 
 class Unit(nn.Sequential):
@@ -97,6 +100,12 @@ class DemoNet(nn.Module):
             x = up(F.interpolate(narrow(x), skip.shape[-2:], mode="bilinear", align_corners=False) + skip)
         logarithm: Tensor = self.answer(x)[:, 0]
         return logarithm
+
+
+def load_network() -> DemoNet:
+    """The network in the package; a warning in the log says that it is a demonstration."""
+    LOG.warning("demo_net is %s", WHAT_IT_IS)
+    return shipped()
 
 
 def shipped() -> DemoNet:

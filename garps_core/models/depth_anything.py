@@ -24,7 +24,8 @@ from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import vit
 from garps_core.models.dpt import DptHead, Grid, enlarged
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
-from garps_core.weights.manifest import MAX_DEPTH_M
+from garps_core.weights.load import load_weights
+from garps_core.weights.manifest import MAX_DEPTH_M, range_of
 from garps_core.weights.state_dict import load_strictly
 
 RGBImage = npt.NDArray[np.uint8]
@@ -68,6 +69,16 @@ class DepthAnythingV2(nn.Module):
         """(B, 3, H, W), normalised, sides multiples of 14 -> depth (B, H, W), float32, metres."""
         logit: Tensor = self.depth_head(self.pretrained(image, self.head.taps))
         return self.max_depth * logit.squeeze(1).float().sigmoid()
+
+
+def load_network(weights: str, scene: str) -> DepthAnythingV2:
+    """Read the weights by name or file ("" = the first installed) and build the network, on the CPU.
+
+    scene: any, indoor or outdoor. Raises WeightsError.
+    """
+    variant = "" if scene == "any" else scene
+    path, read = load_weights(weights, "depth_anything", variant)
+    return built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
 
 
 def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnythingV2:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is settled before the first pair, live and offline: whose depth it is, networks in_use, loops compiled."""
+"""What is settled before the first pair, live and offline: whose depth it is, networks loaded, loops compiled."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from garps_core.align import NETWORKS as SHARED
 from garps_core.align import estimate_relative_pose
 from garps_core.config import DEPTH_NETWORKS, Config, Reconstruction
 from garps_core.config.combinations import check_settings, check_start
@@ -17,6 +18,7 @@ from garps_core.config.lifting import Lifting
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
+from garps_core.models.in_use import Networks
 from garps_core.objective import compiled
 from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
@@ -46,7 +48,7 @@ def check_method(config: Config) -> None:
 
 def completed(view: View, config: Config) -> View:
     """A view by itself with what its mixture needs; a two-view network gives nothing before it sees a pair."""
-    return view if config.reconstruction.method == "two_view" else with_depth([view], config)[0]
+    return view if config.reconstruction.method == "two_view" else with_depth([view], config, SHARED)[0]
 
 
 def depth_share(config: Config) -> float:
@@ -91,8 +93,8 @@ def two_view_name(config: Config) -> str:
     return f"{start.method} (weights {start.weights or default(start.method).name})"
 
 
-def load_networks(config: Config, say: Callable[[str], None]) -> None:
-    """Load the networks that the settings name, if any, and say what it took.
+def load_networks(config: Config, say: Callable[[str], None], networks: Networks = SHARED) -> None:
+    """Load the networks that the settings name, if any, into `networks`, and say what it took.
 
     Raises:
         WeightsError: weights that are not installed, or not what they should be.
@@ -102,22 +104,17 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
     two_view = config.start.method in TWO_VIEW
     if needs_depth(config) and settings.semantics == "none" and not two_view:
         return
-    from garps_core.models import in_use
-
     if two_view:
-        from garps_core.models.two_view_in_use import two_view_model
-
         names.append(two_view_name(config))
-        two_view_model(config)
+        networks.two_view(config)
     if not needs_depth(config) and settings.method != "two_view":
         names.append(scale_from(config).removesuffix(", m"))
-        in_use.on_device(in_use.depth_network_of(settings), config.device)
+        networks.depth_network(config)
     if settings.method == "flash3d":
-        in_use.flash3d(settings.flash3d_weights, config.device)
+        networks.flash3d(config)
     if settings.semantics != "none":
         names.append(f"labels ({settings.semantics})")
-        segmenter = in_use.segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
-        in_use.on_device(segmenter, config.device)
+        networks.segmenter(config)
     say(f"loaded {' and '.join(names)} in {time.perf_counter() - begin:.1f} s")
 
 

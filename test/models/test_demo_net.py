@@ -20,8 +20,9 @@ from garps_core.cli.doctor import examine
 from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.mixtures.reconstruct import with_depth
-from garps_core.models import demo_net, in_use
+from garps_core.models import demo_net
 from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
+from garps_core.models.in_use import Networks
 from garps_core.weights.reader import read_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -157,7 +158,7 @@ def test_it_is_called_a_demonstration(
 ) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # loaded anew
     with caplog.at_level(logging.WARNING, "garps_core"):
-        assert isinstance(in_use.demonstration(), DemoNet)
+        assert isinstance(Networks().depth_network(Config.preset("demo_net")), DemoNet)
     assert f"demo_net is {DEMONSTRATION}" in caplog.text
     rows, _ = examine()
     assert DEMONSTRATION in dict(rows)["demo_net"]

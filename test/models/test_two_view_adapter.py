@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from box_room import K_WORDS
-from network_weights import write_pair
+from network_weights import shared, write_pair
 from places import ROOT
 from point_map_cases import Errors, point_maps, true_views
 from two_view_fixtures import CALLS, FAULTS, RECORDED, installed_here, installed_package, write_maps
@@ -123,7 +123,7 @@ def test_a_sensors_depth_sharpens_it(room: RoomPair, maps: Path) -> None:
 def test_estimated_intrinsics_are_told_and_doubted(room: RoomPair, maps: Path, method: str, preset: str) -> None:
     views = bare(room) if method == "two_view" else sensed(room)
     settings = recorded(maps, preset, reconstruction__method=method)
-    K = estimate_intrinsics(room.rgb0, room.rgb1, settings)
+    K = estimate_intrinsics(room.rgb0, room.rgb1, settings, shared())
     unknown = [View(view.rgb, own, view.depth, K_estimated=True) for view, own in zip(views, K, strict=True)]
     found, given = estimate_relative_pose(*unknown, settings), estimate_relative_pose(*views, settings)
     assert [RECORDED] == CALLS, "one pair, one answer, for all three"
@@ -143,11 +143,11 @@ def test_a_given_prior_is_put_together_with_the_network(room: RoomPair, maps: Pa
     near = Prior(se3_exp(np.array([0.02, -0.01, 0.01, 0, 0.005, 0])) @ room.T_1_0, np.diag([4e-4] * 3 + [1e-4] * 3))
     far = Prior(se3_exp(np.array([0.8, 0, 0, 0, 0.3, 0])) @ room.T_1_0, np.diag([1e-4] * 3 + [1e-4] * 3))
     settings = recorded(maps, reconstruction__method="two_view")
-    (alone,), (together,) = initialise(*bare(room), settings), initialise(*bare(room), settings, near)
+    (alone,), (together,) = (initialise(*bare(room), settings, prior, shared()) for prior in (None, near))
     assert together.origin == "given and recorded"
     assert np.all(np.diag(together.covariance) < np.diag(near.covariance))
     assert np.all(np.diag(together.covariance) < np.diag(alone.covariance))
-    rivals = initialise(*bare(room), settings, far)
+    rivals = initialise(*bare(room), settings, far, shared())
     assert [one.origin for one in rivals] == [RECORDED, "given"]
     assert "contradicts the given prior" in rivals[0].reason and "contradicts the recorded" in rivals[1].reason
     for prior, origin in ((near, "given and recorded"), (far, RECORDED)):
