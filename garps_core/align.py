@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from garps_core.config import Alignment, Config
+from garps_core.config.combinations import check_settings
 from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
@@ -21,6 +22,7 @@ from garps_core.models.in_use import Networks
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import DeviceMixture, overlap, to_device
 from garps_core.objective.state import WeightedStart
+from garps_core.point_maps import PairMaps
 from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
 from garps_core.solver.search import search
@@ -59,10 +61,17 @@ def estimate_relative_pose(
 
 
 def estimate_with_mixtures(
-    source: View, target: View, config: Config | None = None, prior: Prior | None = None
+    source: View,
+    target: View,
+    config: Config | None = None,
+    prior: Prior | None = None,
+    maps: PairMaps | None = None,
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
-    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
-    estimate, mixtures = _estimated(source, target, config or Config(), prior)
+    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none.
+
+    maps: answer of the two-view network about this pair, where it has been asked before, e.g. for the intrinsics.
+    """
+    estimate, mixtures = _estimated(source, target, config or Config(), prior, maps)
     focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
     origin = depth_origin((source, target), config or Config())
     return replace(estimate, estimated_fx_px=(focal[0], focal[1]), depth_from=origin), mixtures
@@ -80,12 +89,15 @@ def _doubting(config: Config, *views: View) -> Config:
 
 
 def _estimated(
-    source: View, target: View, config: Config, prior: Prior | None
+    source: View, target: View, config: Config, prior: Prior | None, maps: PairMaps | None
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     checked_device(config.device)
     spent, begin = {}, time.perf_counter()
     try:
-        views = with_depth((source, target), config, NETWORKS)
+        if maps is None and config.reconstruction.method == "two_view":
+            check_settings(config)
+            maps = NETWORKS.pair_maps(source.rgb, target.rgb, config)
+        views = with_depth((source, target), config, NETWORKS, maps)
         if views != [source, target]:  # only a network takes time
             spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
         config = _doubting(config, *views)
@@ -97,7 +109,7 @@ def _estimated(
         return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
     spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
     try:
-        starts = initialise(views[0], views[1], config, prior, NETWORKS)
+        starts = initialise(views[0], views[1], config, prior, NETWORKS, maps)
     except InitialisationError as failure:
         spent["initialise"] = time.perf_counter() - begin
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)

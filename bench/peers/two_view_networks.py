@@ -23,7 +23,7 @@ def dust3r(source: View, target: View) -> Float64Array:
 
 
 def _pose(source: View, target: View, network: str) -> Float64Array:
-    """The network's pose. It remembers the last pair: asked right after GARPS about the same, it takes no time."""
+    """The network's pose. It keeps the tokens of the last pictures: asked after GARPS, it only decodes."""
     try:
         (start,) = initialise(source, target, Config().replace({"start.method": network}), networks=NETWORKS)
     except WeightsError as error:

@@ -100,11 +100,14 @@ def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) 
     if not variant.same_start:
         of_start = config
     try:
-        views = with_depth([pair.source, pair.target], config, NETWORKS)
+        maps = None
+        if config.reconstruction.method == "two_view":
+            maps = NETWORKS.pair_maps(pair.source.rgb, pair.target.rgb, config)
+        views = with_depth([pair.source, pair.target], config, NETWORKS, maps)
         x, y = (variant.mixture(mixture) for mixture in mixtures_of(views, config, NETWORKS))
         if variant.labels and pair.labels is not None:
             x, y = (labelled(m, seen, v.K) for m, seen, v in zip((x, y), pair.labels, views, strict=True))
-        starts = initialise(views[0], views[1], of_start, prior, NETWORKS)
+        starts = initialise(views[0], views[1], of_start, prior, NETWORKS, maps)
         if not variant.believes_start:
             starts = tuple(replace(start, covariance=VAGUE * start.covariance) for start in starts)
         return best_of(x, y, starts, config)

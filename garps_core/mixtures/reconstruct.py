@@ -25,7 +25,7 @@ from garps_core.errors import ConfigError, InputError, ReconstructionError, Weig
 from garps_core.mixtures.frustum import MIN_COMPONENTS
 from garps_core.mixtures.lift import lift
 from garps_core.models.in_use import Networks, dtype_of
-from garps_core.point_maps import own_depth
+from garps_core.point_maps import PairMaps, own_depth
 from garps_core.types import Mixture, View
 
 
@@ -49,17 +49,25 @@ def reconstruct(view: View, config: Config | None = None, networks: Networks | N
     return mixture_of(with_depth([view], config, networks)[0], config, networks)
 
 
-def with_depth(views: Sequence[View], config: Config, networks: Networks | None = None) -> list[View]:
+def with_depth(
+    views: Sequence[View], config: Config, networks: Networks | None = None, maps: PairMaps | None = None
+) -> list[View]:
     """The views with the depth that their mixtures are made of: their own, or a network's in one pass.
 
-    networks: as for `reconstruct`. Raises as `reconstruct`.
+    Args:
+        views: one or more; for a two-view network source and target.
+        config: `reconstruction` is used, `start` too for a two-view network.
+        networks: as for `reconstruct`.
+        maps: answer of the two-view network about these two views; None = it is asked where it is needed.
+    Raises:
+        ReconstructionError, ConfigError, WeightsError, ModelError, InputError: as `reconstruct`.
     """
     networks, method = networks or Networks(), config.reconstruction.method
     if method == "ply":
         raise ConfigError("reconstruction.method is ply: expected mixtures from files, as `garps align a.ply b.ply`")
     if method == "two_view":
         check_settings(config)
-        return _of_pair(views, config, networks)
+        return _of_pair(views, config, networks, maps)
     needing = [i for i, view in enumerate(views) if view.depth is None or method in DEPTH_NETWORKS]
     if not needing or method == "rgbd":
         return list(views)
@@ -89,12 +97,12 @@ def depth_origin(views: Sequence[View], config: Config) -> str:
     return "given" if method == "rgbd" or (there and method != "depth_anything_v2") else "depth_anything_v2"
 
 
-def _of_pair(views: Sequence[View], config: Config, networks: Networks) -> list[View]:
+def _of_pair(views: Sequence[View], config: Config, networks: Networks, maps: PairMaps | None) -> list[View]:
     if len(views) != 2:
         raise ConfigError(
             f"reconstruction.method is two_view, whose network looks at pairs: expected 2 views, not {len(views)}"
         )
-    maps, least = networks.pair_maps(views[0].rgb, views[1].rgb, config), config.start.min_confidence
+    maps, least = maps or networks.pair_maps(views[0].rgb, views[1].rgb, config), config.start.min_confidence
     if not maps.metric:
         raise ConfigError(
             f"reconstruction.method is two_view and the points of {maps.origin} have no metres: expected mast3r"

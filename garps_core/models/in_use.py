@@ -97,13 +97,12 @@ class Networks:
             ModelError: too little memory, values that are not finite, or whatever goes wrong in an adapter.
             ConfigError: no two-view network is chosen, or no adapter of that name is installed.
         """
-        from garps_core.models.two_view_in_use import Asked, maps_by_adapter
+        from garps_core.models.two_view_in_use import maps_by_adapter
 
         model = self.two_view(config)
-        asked = self._once("last pair", (), Asked)
         if config.start.method == "adapter":
-            return maps_by_adapter(config.start.adapter, lambda: asked(model, source, target))
-        return asked(model, source, target)
+            return maps_by_adapter(config.start.adapter, model, source, target)
+        return model(source, target)
 
     def depth_network(self, config: Config) -> DepthAnythingV2 | DemoNet:
         """The depth network of `config.reconstruction`, on the device. Raises WeightsError, ModelError, ConfigError."""

@@ -3,38 +3,20 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from garps_core.errors import ConfigError, GarpsError, InputError, ModelError, WeightsError
-from garps_core.models.mast3r import NaverModel, digest
+from garps_core.models.mast3r import NaverModel
 from garps_core.models.two_view import TwoView, built_from
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
 from garps_core.weights.load import load_weights
 from garps_core.weights.manifest import of_file
 
-__all__ = ["ADAPTERS", "Asked", "NaverModel", "load_adapter", "load_network", "maps_by_adapter"]
+__all__ = ["ADAPTERS", "NaverModel", "load_adapter", "load_network", "maps_by_adapter"]
 
 ADAPTERS = "garps_core.two_view"
 """Entry points of installed packages in this group are adapters: `NAME = "package.module:load"`."""
-
-
-class Asked:
-    """The pair that was asked about last, and the answer: depth, start pose and intrinsics all want the same."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._answer: tuple[TwoViewModel, bytes, PairMaps] | None = None
-
-    def __call__(self, model: TwoViewModel, source: Picture, target: Picture) -> PairMaps:
-        """The answer, new where the model or a picture is another."""
-        key = digest(source) + digest(target)
-        with self._lock:
-            if self._answer is None or self._answer[0] is not model or self._answer[1] != key:
-                self._answer = None  # it would keep a network alive that is no longer asked
-                self._answer = model, key, model(source, target)
-            return self._answer[2]
 
 
 def load_network(kind: str, weights: str) -> tuple[TwoView, str]:
@@ -67,10 +49,10 @@ def load_adapter(name: str, weights: str, device: str) -> TwoViewModel:
         raise ConfigError(f"the adapter {name!r} ({there[name].value}) cannot be loaded: {_told(error)}") from error
 
 
-def maps_by_adapter(name: str, ask: Callable[[], PairMaps]) -> PairMaps:
-    """What `ask` returns. Raises ModelError for whatever goes wrong in the adapter, or is not `PairMaps`."""
+def maps_by_adapter(name: str, model: TwoViewModel, source: Picture, target: Picture) -> PairMaps:
+    """Point maps by an adapter. Raises ModelError for whatever goes wrong in it, or is not `PairMaps`."""
     try:
-        found = ask()
+        found = model(source, target)
     except (ConfigError, InputError, WeightsError):
         raise
     except Exception as error:
