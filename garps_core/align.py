@@ -17,7 +17,8 @@ from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
-from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_depth
+from garps_core.mixtures.reconstruct import mixtures_of, with_depth
+from garps_core.models.depth_networks import depth_from
 from garps_core.models.in_use import Networks
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import DeviceMixture, overlap, to_device
@@ -73,7 +74,7 @@ def estimate_with_mixtures(
     """
     estimate, mixtures = _estimated(source, target, config or Config(), prior, maps)
     focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
-    origin = depth_origin((source, target), config or Config())
+    origin = depth_from((source, target), config or Config())
     return replace(estimate, estimated_fx_px=(focal[0], focal[1]), depth_from=origin), mixtures
 
 

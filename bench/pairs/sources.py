@@ -18,12 +18,13 @@ from bench.pairs.readers.pair_list import RAW
 from garps_core import Config, GarpsError
 from garps_core.align import NETWORKS
 from garps_core.mixtures.reconstruct import with_depth
+from garps_core.models.depth_networks import presets
 
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
 NAMES = (PAIRS, ROOMS, BARE, *READERS)
 """`pairs`: a folder with a pairs.json; `rooms`, `bare`: generated; the others: `bench.pairs.readers`."""
 SENSOR, MONOCULAR, DEMO_NET = "sensor", "monocular", "demo_net"
-DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", DEMO_NET: "demo_net", "depth_anything_v2": "monocular"}
+DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", **presets()}
 """Whose depth: the set's own, the same spoilt as a network would, or a network's; and the preset that goes with it."""
 NOTHING_GIVEN = ("none", "disturbed")
 BY_DEFAULT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {

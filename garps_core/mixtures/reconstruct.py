@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 
 from garps_core.checks import Float32Array
-from garps_core.config import DEPTH_NETWORKS, Config
+from garps_core.config import Config, depth_networks
 from garps_core.config.combinations import check_settings
 from garps_core.errors import ConfigError, InputError, ReconstructionError, WeightsError
 from garps_core.mixtures.frustum import MIN_COMPONENTS
@@ -68,7 +68,7 @@ def with_depth(
     if method == "two_view":
         check_settings(config)
         return _of_pair(views, config, networks, maps)
-    needing = [i for i, view in enumerate(views) if view.depth is None or method in DEPTH_NETWORKS]
+    needing = [i for i, view in enumerate(views) if view.depth is None or method in depth_networks()]
     if not needing or method == "rgbd":
         return list(views)
     check_settings(config)
@@ -82,19 +82,6 @@ def with_depth(
     for i, depth in zip(needing, depths, strict=True):
         found[i] = _given(views[i], depth)
     return found
-
-
-def depth_origin(views: Sequence[View], config: Config) -> str:
-    """Where `with_depth` takes it from, for people: "given", or the network."""
-    method = config.reconstruction.method
-    if method == "demo_net":
-        from garps_core.models.demo_net import WHAT_IT_IS
-
-        return f"demo_net, {WHAT_IT_IS}"
-    if method == "two_view":
-        return config.start.method
-    there = all(view.depth is not None for view in views)
-    return "given" if method == "rgbd" or (there and method != "depth_anything_v2") else "depth_anything_v2"
 
 
 def _of_pair(views: Sequence[View], config: Config, networks: Networks, maps: PairMaps | None) -> list[View]:

@@ -12,7 +12,6 @@ pixel's ray; it answers with depth over focal length, since that is what a pictu
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from importlib.resources import as_file, files
 
@@ -24,7 +23,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.checks import Float32Array
+from garps_core.config import Reconstruction
+from garps_core.devices import on_device
 from garps_core.errors import InputError, ModelError
+from garps_core.models.depth_networks import DepthNetwork
 from garps_core.types import View
 from garps_core.weights.reader import read_tensors
 from garps_core.weights.state_dict import load_strictly
@@ -44,8 +46,6 @@ FILE = "demo_net.safetensors"
 MAX_BYTES = 6_000_000
 MAX_ASPECT = 3
 """Of a picture's sides: beyond, nothing like it was ever seen in training."""
-
-LOG = logging.getLogger("garps_core")
 
 
 class Unit(nn.Sequential):
@@ -102,10 +102,9 @@ class DemoNet(nn.Module):
         return logarithm
 
 
-def load_network() -> DemoNet:
-    """The network in the package; a warning in the log says that it is a demonstration."""
-    LOG.warning("demo_net is %s", WHAT_IT_IS)
-    return shipped()
+def load_network(weights: str, scene: str, device: str) -> DemoNet:
+    """The network in the package on the device; it has no other weights and knows no scene but its own."""
+    return on_device(shipped(), device)
 
 
 def shipped() -> DemoNet:
@@ -132,8 +131,8 @@ def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Fl
     return found, float(np.sqrt(fx * fy) / UNIT_FOCAL_PX)
 
 
-def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
-    """Depth of each view, HxW float32 m along z, all in one pass.
+def depth_of(network: DemoNet, views: Sequence[View], settings: Reconstruction | None = None) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass; no setting changes it.
 
     Raises:
         InputError: a picture more than `MAX_ASPECT` times as long as wide, or as wide as long.
@@ -159,3 +158,6 @@ def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> F
     if not np.isfinite(depth).all():
         raise ModelError("the depth of demo_net is not finite: expected numbers; is its file what was shipped?")
     return np.asarray(depth, np.float32)
+
+
+NETWORK = DepthNetwork("in the package", load_network, depth_of, preset="demo_net", warning=WHAT_IT_IS)

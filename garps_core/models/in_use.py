@@ -6,39 +6,33 @@ This module is light to import: the file of a network is imported when that netw
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 import torch
-from torch import nn
 
 from garps_core.checks import Float32Array, IntArray
 from garps_core.config import Config
 from garps_core.config.start import TWO_VIEW
-from garps_core.devices import checked_device
-from garps_core.errors import ConfigError, ModelError, ReconstructionError
+from garps_core.devices import on_device
+from garps_core.errors import ConfigError
+from garps_core.models.depth_networks import depth_network, load_network, metric_depths, network_name
 from garps_core.point_maps import PairMaps, Picture, TwoViewModel
 from garps_core.types import View
 from garps_core.weights.store import weights_folder
 
 if TYPE_CHECKING:
-    from garps_core.models.demo_net import DemoNet
-    from garps_core.models.depth_anything import DepthAnythingV2
     from garps_core.models.flash3d import Flash3D
     from garps_core.models.mask2former import Mask2Former
     from garps_core.models.mast3r import NaverModel
     from garps_core.models.semantics import Segmenter
 
-AT_THE_END = 0.98
-"""Share of a network's largest depth; a pixel beyond it is at the end of the network's range."""
-
-DTYPE = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 Made = TypeVar("Made")
-Network = TypeVar("Network", bound=nn.Module)
+LOG = logging.getLogger("garps_core")
 _ALIVE: weakref.WeakSet[Networks] = weakref.WeakSet()
 
 
@@ -64,21 +58,11 @@ class Networks:
             WeightsError: none installed, or not what it should be. ModelError: too little memory, not finite.
             InputError: a picture too elongated for the network.
             ReconstructionError: most of a picture lies at the end of the network's range.
+            ConfigError: the network cannot be loaded.
         """
-        from garps_core.models import demo_net
-        from garps_core.models.depth_anything import DepthAnythingV2, depth_of, focal_factors
-
-        settings = config.reconstruction
-        network = self.depth_network(config)
-        if not isinstance(network, DepthAnythingV2):
-            return [depth * np.float32(settings.depth_scale) for depth in demo_net.depth_of(network, views)]
-        images = [view.rgb for view in views]
-        fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
-        found = depth_of(network, images, depth_scale=settings.depth_scale, fx=fx, dtype=dtype_of(config))
-        largest = network.max_depth * settings.depth_scale * focal_factors(images, fx)
-        for view, depth, largest_m in zip(views, found, largest, strict=True):
-            _check_range(view, depth, float(largest_m))
-        return found
+        return metric_depths(
+            network_name(config.reconstruction), self.depth_network(config), views, config.reconstruction
+        )
 
     def labels(self, rgb: Picture, config: Config) -> IntArray:
         """Class of every pixel, HxW, by the segmentation of the settings. Raises WeightsError, ModelError."""
@@ -104,20 +88,18 @@ class Networks:
             return maps_by_adapter(config.start.adapter, model, source, target)
         return model(source, target)
 
-    def depth_network(self, config: Config) -> DepthAnythingV2 | DemoNet:
+    def depth_network(self, config: Config) -> Any:
         """The depth network of `config.reconstruction`, on the device. Raises WeightsError, ModelError, ConfigError."""
         settings = config.reconstruction
-        if settings.method == "demo_net":
-            from garps_core.models import demo_net
+        name = network_name(settings)
+        key = name, settings.depth_weights, settings.scene, config.device
 
-            return on_device(self._once("demo_net", (), demo_net.load_network), config.device)
-        from garps_core.models import depth_anything
+        def load() -> Any:
+            if warning := depth_network(name).warning:
+                LOG.warning("%s is %s", name, warning)
+            return load_network(*key)
 
-        key = settings.depth_weights, settings.scene
-        return on_device(
-            self._once("depth_anything_v2", key, lambda: depth_anything.load_network(*key)),
-            config.device,
-        )
+        return self._once("depth", key, load)
 
     def flash3d(self, config: Config) -> Flash3D:
         """Flash3D with the weights of the settings, on the device. Raises WeightsError, ModelError, ConfigError."""
@@ -185,26 +167,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_unlock_all)
 
 
-def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
-    far = float(np.mean(depth >= AT_THE_END * largest_m))
-    if far > 0.5:
-        raise ReconstructionError(
-            f"{far:.0%} of the network's depth of {view.frame_id or 'a view'} is {largest_m:g} m, all it can say: "
-            "expected rooms for indoor weights, streets for outdoor ones, and no relative model's"
-        )
-
-
 def dtype_of(config: Config) -> torch.dtype:
     """The type that `reconstruction.network_dtype` names."""
-    return DTYPE[config.reconstruction.network_dtype]
-
-
-def on_device(network: Network, device: str) -> Network:
-    """The network, moved there. Raises ConfigError for a device that is not there, ModelError where it does not fit."""
-    try:
-        return network.to(checked_device(device))
-    except torch.cuda.OutOfMemoryError as error:
-        raise ModelError(
-            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit; free some, "
-            f"choose a smaller network, or use the CPU ({error})"
-        ) from None
+    dtype: torch.dtype = getattr(torch, config.reconstruction.network_dtype)
+    return dtype

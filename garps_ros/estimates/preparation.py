@@ -12,26 +12,30 @@ import numpy as np
 
 from garps_core.align import NETWORKS as SHARED
 from garps_core.align import estimate_relative_pose
-from garps_core.config import DEPTH_NETWORKS, Config, Reconstruction
+from garps_core.config import Config, Reconstruction, depth_networks
 from garps_core.config.combinations import check_settings, check_start
 from garps_core.config.lifting import Lifting
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
+from garps_core.models.depth_networks import with_weights
 from garps_core.models.in_use import Networks
 from garps_core.objective import compiled
 from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
-NETWORKS = (*DEPTH_NETWORKS, "flash3d", "two_view")
-"""Methods that ask a network for depth; the others need the sensor's."""
 LONG_S = 2.0
 """Compiled loops that are read from where they were kept take less; more is worth a line."""
 
 
+def methods_without_sensor() -> tuple[str, ...]:
+    """Return the methods that ask a network for depth; the others need the sensor's."""
+    return *depth_networks(), "flash3d", "two_view"
+
+
 def needs_depth(config: Config) -> bool:
     """Whether every image needs the sensor's depth; where a network gives it, the sensor's is left alone."""
-    return config.reconstruction.method not in NETWORKS
+    return config.reconstruction.method not in methods_without_sensor()
 
 
 def check_method(config: Config) -> None:
@@ -39,7 +43,7 @@ def check_method(config: Config) -> None:
     if config.reconstruction.method == "ply":
         raise ConfigError(
             "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network "
-            f"({', '.join(NETWORKS)}) for images on topics; `garps align a.ply b.ply` takes files"
+            f"({', '.join(methods_without_sensor())}) for images on topics; `garps align a.ply b.ply` takes files"
         )
     check_start(config.start)
     if not needs_depth(config):
@@ -58,7 +62,7 @@ def depth_share(config: Config) -> float:
 
 def settings_of_completed(config: Config) -> Config:
     """The settings for views that are `completed` already: a network's depth then counts as given."""
-    of_network = config.reconstruction.method in DEPTH_NETWORKS
+    of_network = config.reconstruction.method in depth_networks()
     return config.replace({"reconstruction.method": "rgbd"} if of_network else {})
 
 
@@ -71,13 +75,7 @@ def scale_from(config: Config) -> str:
     settings = config.reconstruction
     if settings.method == "two_view":
         return f"{two_view_name(config)} of every pair, m"
-    if settings.method == "demo_net":
-        from garps_core.models.demo_net import WHAT_IT_IS
-
-        return f"demo_net ({WHAT_IT_IS}), m"
-    variant = "" if settings.scene == "any" else settings.scene
-    weights = settings.depth_weights or default("depth_anything", variant).name
-    found = f"depth_anything_v2 (weights {weights}), m"
+    found = f"{with_weights(settings)}, m"
     if settings.method == "flash3d":
         found = f"flash3d (weights {settings.flash3d_weights or default('flash3d').name}) on {found}"
     return found

@@ -4,33 +4,33 @@
 import os
 import pickle
 import threading
-from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from garps_core import Config
-from garps_core.models import demo_net
+from garps_core.models import in_use
+from garps_core.models.depth_networks import load_network
 from garps_core.models.in_use import Networks
 
 DEMO = Config.preset("demo_net")
 
 
 @pytest.fixture
-def loads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """One entry, the process, for every time that demo_net is loaded, which takes a while."""
-    found: list[int] = []
-    load: Callable[[], demo_net.DemoNet] = demo_net.load_network
+def loads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """One entry, the name, for every time that a depth network is loaded, which takes a while."""
+    found: list[str] = []
 
-    def slowly() -> demo_net.DemoNet:
-        found.append(os.getpid())
+    def slowly(name: str, *given: str) -> Any:
+        found.append(name)
         threading.Event().wait(0.05)
-        return load()
+        return load_network(name, *given)
 
-    monkeypatch.setattr(demo_net, "load_network", slowly)
+    monkeypatch.setattr(in_use, "load_network", slowly)
     return found
 
 
-def test_threads_that_want_a_network_at_once_load_it_once(loads: list[int]) -> None:
+def test_threads_that_want_a_network_at_once_load_it_once(loads: list[str]) -> None:
     networks, gate, found = Networks(), threading.Barrier(4), []
 
     def want() -> None:
@@ -45,13 +45,13 @@ def test_threads_that_want_a_network_at_once_load_it_once(loads: list[int]) -> N
     assert len(loads) == 1 and len(found) == 4 and len(set(map(id, found))) == 1
 
 
-def test_every_owner_has_its_own(loads: list[int]) -> None:
+def test_every_owner_has_its_own(loads: list[str]) -> None:
     one, other = Networks(), Networks()
     assert one.depth_network(DEMO) is one.depth_network(DEMO) is not other.depth_network(DEMO)
     assert len(loads) == 2
 
 
-def test_a_copy_is_empty(loads: list[int]) -> None:
+def test_a_copy_is_empty(loads: list[str]) -> None:
     networks = Networks()
     first = networks.depth_network(DEMO)
     copy = pickle.loads(pickle.dumps(networks))
@@ -81,7 +81,7 @@ def test_what_could_not_be_loaded_is_tried_again() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-def test_a_child_forked_while_a_thread_loads_does_not_hang(loads: list[int]) -> None:
+def test_a_child_forked_while_a_thread_loads_does_not_hang(loads: list[str]) -> None:
     networks, loading, forked = Networks(), threading.Event(), threading.Event()
 
     def load() -> int:
