@@ -12,14 +12,18 @@ import numpy as np
 import torch
 
 from garps_core.config import Alignment, Config
+from garps_core.config.combinations import check_settings
 from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
 from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
-from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_depth
+from garps_core.mixtures.reconstruct import mixtures_of, with_depth
+from garps_core.models.depth_networks import depth_from
+from garps_core.models.in_use import Networks
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import DeviceMixture, overlap, to_device
 from garps_core.objective.state import WeightedStart
+from garps_core.point_maps import PairMaps
 from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
 from garps_core.solver.search import search
@@ -33,6 +37,9 @@ SEARCHED_SIGMAS = 3.0
 
 CENTRING = 0.01
 """Sigma of a principal point that is taken to lie in the image's middle, over the image's longer side."""
+
+NETWORKS = Networks()
+"""Networks that all estimates of this process share."""
 
 
 def estimate_relative_pose(
@@ -55,12 +62,19 @@ def estimate_relative_pose(
 
 
 def estimate_with_mixtures(
-    source: View, target: View, config: Config | None = None, prior: Prior | None = None
+    source: View,
+    target: View,
+    config: Config | None = None,
+    prior: Prior | None = None,
+    maps: PairMaps | None = None,
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
-    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none."""
-    estimate, mixtures = _estimated(source, target, config or Config(), prior)
+    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none.
+
+    maps: answer of the two-view network about this pair, where it has been asked before, e.g. for the intrinsics.
+    """
+    estimate, mixtures = _estimated(source, target, config or Config(), prior, maps)
     focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
-    origin = depth_origin((source, target), config or Config())
+    origin = depth_from((source, target), config or Config())
     return replace(estimate, estimated_fx_px=(focal[0], focal[1]), depth_from=origin), mixtures
 
 
@@ -76,16 +90,19 @@ def _doubting(config: Config, *views: View) -> Config:
 
 
 def _estimated(
-    source: View, target: View, config: Config, prior: Prior | None
+    source: View, target: View, config: Config, prior: Prior | None, maps: PairMaps | None
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
     checked_device(config.device)
     spent, begin = {}, time.perf_counter()
     try:
-        views = with_depth((source, target), config)
+        if maps is None and config.reconstruction.method == "two_view":
+            check_settings(config)
+            maps = NETWORKS.pair_maps(source.rgb, target.rgb, config)
+        views = with_depth((source, target), config, NETWORKS, maps)
         if views != [source, target]:  # only a network takes time
             spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
         config = _doubting(config, *views)
-        x, y = mixtures_of(views, config)
+        x, y = mixtures_of(views, config, NETWORKS)
     except (ModelError, ReconstructionError) as failure:
         of_pair = config.reconstruction.method == "two_view"
         if isinstance(failure, WeightsError) or (isinstance(failure, ReconstructionError) and not of_pair):
@@ -93,7 +110,7 @@ def _estimated(
         return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
     spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
     try:
-        starts = initialise(views[0], views[1], config, prior)
+        starts = initialise(views[0], views[1], config, prior, NETWORKS, maps)
     except InitialisationError as failure:
         spent["initialise"] = time.perf_counter() - begin
         return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)

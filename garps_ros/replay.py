@@ -18,9 +18,10 @@ from rich.console import Console
 from rich.progress import Progress
 
 from garps_core.align import estimate_relative_pose
-from garps_core.config import METHODS, PRESETS, Config, preset_for
+from garps_core.config import PRESETS, Config, methods
 from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
+from garps_core.models.depth_networks import preset_for
 from garps_core.types import PoseEstimate, View
 from garps_ros.cameras import CameraTopics
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
@@ -104,7 +105,7 @@ With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong in
 
 Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
 Reconstruction = Annotated[
-    str | None, typer.Option(help=f"Whose depth, one of {', '.join(METHODS[:-1])}. [auto: the depth topics]")
+    str | None, typer.Option(help=f"Whose depth, one of {', '.join(methods()[:-1])}. [auto: the depth topics]")
 ]
 ToRos = Annotated[bool, typer.Option("--to-ros", help="Play the recording into a live ROS 2 graph instead.")]
 Rate = Annotated[float, typer.Option(help="With --to-ros: seconds of the recording per second.", min=0.001, max=1000)]

@@ -141,13 +141,6 @@ def _demo_net() -> Config:
     )
 
 
-def preset_for(method: str, with_depth: bool) -> str:
-    """Name of the preset that goes with `reconstruction.method`, for views that bring depth or do not."""
-    if method == "demo_net":
-        return "demo_net"
-    return "default" if with_depth else "monocular"
-
-
 PRESETS: dict[str, Callable[[], Config]] = {
     "default": Config,
     "sensor": Config,

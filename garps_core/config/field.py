@@ -64,7 +64,10 @@ class Checked:
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, limits = getattr(self, f.name), description(f)
+            value = getattr(self, f.name)
+            if type(value) is type(f.default) and value == f.default:
+                continue  # choices that depend on what is installed are not looked up at import
+            limits = description(f)
             name = self._prefix + f.name
             if limits["choices"] and value not in limits["choices"]:
                 raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")

@@ -157,7 +157,7 @@ def room_of(module: str) -> str:
 
 
 def arrows(*folders: str) -> dict[str, set[str]]:
-    """Module -> modules of this repository that it imports, without the packages that are named on the way to a part."""
+    """Map a module to those of this repository that it imports, without packages named on the way to a part."""
     graph = {module_of(path): imported_modules(path) for path in sources(*folders)}
     return {
         module: {
