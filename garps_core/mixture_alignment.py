@@ -29,13 +29,13 @@ SEARCHED_SIGMAS = 3.0
 """A search may stop in a neighbouring optimum, so its sigmas are multiplied by this."""
 
 
-def best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
-    """The best estimate of several initial poses; where features led nowhere, also a search from identity is tried.
+def best_alignment(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
+    """Return the best estimate from several start poses. Where features led nowhere, identity is searched around, too.
 
     Args:
-        x, y: source and target, as `reconstruct` makes them.
-        starts: at least one, as `initialise` gives them.
-        config: as for `align_mixtures`.
+        x, y: mixtures of source and target, as `reconstruct` makes them.
+        starts: at least one start pose, as `initialise` gives them.
+        config: settings, as for `align_mixtures`.
     """
     estimates = [align_mixtures(x, y, start, config) for start in starts]
     best = max(estimates, key=_merit)

@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from garps_core import __version__
-from garps_core.align import NETWORKS, align_mixtures, estimate_with_mixtures
+from garps_core.align import Estimator, align_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.cli.image_files import read_image, read_view
 from garps_core.cli.report import as_json, as_text
@@ -193,13 +193,14 @@ def _of_images(
     config: Config,
     given: Prior | None,
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
+    estimator = Estimator(config)
     try:
-        source, target, maps = _views(files, depths, Ks, scale, config)
+        source, target, maps = _views(files, depths, Ks, scale, estimator)
     except WeightsError:
         raise
     except (InitialisationError, ModelError) as failure:  # only a network that estimates intrinsics raises them
         return PoseEstimate(Status.NO_INITIAL_POSE, f"no --K, and none by {config.start.method}: {failure}"), None
-    return estimate_with_mixtures(source, target, config, given, maps)
+    return estimator.estimate_with_mixtures(source, target, given, maps)
 
 
 def _views(
@@ -207,19 +208,20 @@ def _views(
     depths: tuple[Path | None, Path | None],
     Ks: tuple[Four | None, Four | None],
     scale: Any,
-    config: Config,
+    estimator: Estimator,
 ) -> tuple[View, View, PairMaps | None]:
     if Ks[0] is None and Ks[1] is not None:
         raise InputError("--K-target is given without --K: expected both, --K alone if they are equal, or none")
     if Ks[0] is None:
-        return _uncalibrated(files, depths, scale, config)
+        return _uncalibrated(files, depths, scale, estimator)
     of_source, of_target = _intrinsics("--K", Ks[0]), _intrinsics("--K-target", Ks[1] or Ks[0])
     return read_view(files[0], of_source, depths[0], scale), read_view(files[1], of_target, depths[1], scale), None
 
 
 def _uncalibrated(
-    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], scale: Any, config: Config
+    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], scale: Any, estimator: Estimator
 ) -> tuple[View, View, PairMaps]:
+    config = estimator.config
     if config.start.method not in TWO_VIEW:
         raise InputError(
             "--K is missing: expected FX FY CX CY in pixels, from the camera's calibration; or a two-view network that "
@@ -228,7 +230,7 @@ def _uncalibrated(
     if config.reconstruction.method == "two_view":
         check_settings(config)
     images = [read_image(file) for file in files]
-    maps = NETWORKS.pair_maps(images[0], images[1], config)
+    maps = estimator.networks.pair_maps(images[0], images[1], config)
     Ks = intrinsics_of(maps, (images[0].shape[:2], images[1].shape[:2]), config.start.min_confidence)
     source, target = (read_view(*given, scale, K_estimated=True) for given in zip(files, Ks, depths, strict=True))
     return source, target, maps

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
 from garps_core import Config, Prior, Status, align_mixtures
-from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
+from garps_core.mixture_alignment import _known
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information

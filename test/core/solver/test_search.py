@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
+from garps_core import Config, Status, align_mixtures, estimate_relative_pose, mixture_alignment
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import to_device
@@ -78,7 +78,7 @@ def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeyp
     settings, asked = Config().alignment, []
     by_shape = search._by_shape
     monkeypatch.setattr(search, "_by_shape", lambda *given: asked.append(1) or by_shape(*given))
-    known = align._known(identity(Config(), ""), Config())
+    known = mixture_alignment._known(identity(Config(), ""), Config())
     solutions = search.search(x, y, known, settings)
     found = [next(solutions)]
     assert not asked, "the first is found by sight"
