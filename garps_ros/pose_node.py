@@ -117,7 +117,7 @@ def _is_users(error: Exception) -> bool:
 
 def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
     watched_s = -STALL_S
-    while not (stopped or node.refusal):
+    while not (stopped or node.start_error):
         if time.monotonic() - watched_s > 1.0:
             watched_s = time.monotonic()
             faulthandler.dump_traceback_later(STALL_S, exit=True)
@@ -126,7 +126,7 @@ def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
         except Exception as error:
             node.failed(error, traceback.format_exc())
     faulthandler.dump_traceback_later(STALL_S, exit=True)
-    code = _refuse(node.refusal) if node.refusal and not stopped else 0
+    code = _refuse(node.start_error) if node.start_error and not stopped else 0
     if not node.stop(PATIENCE_S):  # it goes on in native code; the interpreter cannot be taken down under it
         sys.stdout.flush()
         sys.stderr.flush()

@@ -22,7 +22,6 @@ from garps_core.config import METHODS, PRESETS, Config, preset_for
 from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
 from garps_core.types import PoseEstimate, View
-from garps_ros.cameras import CameraTopics
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
 from garps_ros.estimates.outcomes import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.estimates.preparation import (
@@ -33,6 +32,7 @@ from garps_ros.estimates.preparation import (
     needs_depth,
     settings_of_completed,
 )
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.recording.bags import Bag, BagError
 from garps_ros.recording.frame_reader import Frames
 from garps_ros.recording.outputs import Outputs

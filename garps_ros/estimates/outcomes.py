@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
-from garps_ros.cameras import Frame
 from garps_ros.estimates.keyframes import Estimator, KeyframeTracker
-from garps_ros.frames.frame import frame_mismatch, view_from_messages
+from garps_ros.frames.frame import Frame, frame_warning, view_from_messages
 from msg_adapters import MessageError, header_frame_id
 
 FAILURES: dict[type[Exception], str] = {
@@ -86,8 +85,8 @@ class ViewReader:
     def __init__(self, rectified: str, say: Callable[[str], None], allow_resized: bool = False) -> None:
         self.rectified, self.allow_resized, self._say = rectified, allow_resized, say
         self._said: dict[str, str] = {}
-        self.doubts: dict[str, str] = {}
-        """By topic: why the last frame read may hold another camera's calibration or depth."""
+        self.warnings: dict[str, str] = {}
+        """Image topic -> why the last frame read may hold another camera's calibration or depth; "" = no warning."""
 
     def read(self, frame: Frame) -> View:
         """Decode, choose the calibration, undistort. Raises MessageError or InputError."""
@@ -100,8 +99,8 @@ class ViewReader:
             rectified=self.rectified,
             allow_resized=self.allow_resized,
         )
-        self.doubts[topic] = frame_mismatch(frame.image, frame.info, frame.depth)
-        told = f"{decision}; {self.doubts[topic]}" if self.doubts[topic] else decision
+        self.warnings[topic] = frame_warning(frame.image, frame.info, frame.depth)
+        told = f"{decision}; {self.warnings[topic]}" if self.warnings[topic] else decision
         if self._said.get(topic) != told:
             self._said[topic] = told
             self._say(f"{topic}: {told}")

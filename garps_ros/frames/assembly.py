@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from garps_ros.cameras import CameraTopics, Frame
+from garps_ros.frames.frame import CameraTopics, Frame
 from garps_ros.frames.stamps import Pairer
 from msg_adapters import MessageError, header_stamp_ns
 

@@ -12,8 +12,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from garps_ros.cameras import CameraTopics
 from garps_ros.frames.assembly import DEPTH, IMAGE
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.live.subscriptions import Input
 from garps_ros.parameters.settings import NodeSettings
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from garps_ros.cameras import CameraTopics
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly, Complete
+from garps_ros.frames.frame import CameraTopics
 from msg_adapters import MessageError, header_stamp_ns
 
 JUMP_BACK_NS = 1_000_000_000

@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from garps_ros.recording.truncated import salvageable
+from garps_ros.recording.cut_mcap import salvageable
 from msg_adapters import MessageError
 
 

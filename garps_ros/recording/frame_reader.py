@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
+from garps_ros.frames.frame import CameraTopics, Frame
 from garps_ros.recording.bags import Bag
 from msg_adapters import MessageError
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from garps_ros.cameras import CameraTopics
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.recording.bags import Bag, BagError
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

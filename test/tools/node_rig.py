@@ -110,7 +110,7 @@ def count(peer, name, key):
     return int(values(peer, name).get(key, 0))
 
 
-def finding(peer, name, text):
+def check(peer, name, text):
     """Wait until a status says a text; returns its level."""
     peer.wait(lambda: text in peer.diagnostics().get(f"pose_node: {name}", (0, "", {}))[1], what=f"{name}: {text!r}")
     return peer.diagnostics()[f"pose_node: {name}"][0]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recordings import SECOND, START, write
 from ros_messages import camera_info, changed, image
 
-from garps_ros.cameras import CameraTopics
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.frames.stamps import MAX_WAITING_LIVE, Pairer
 from garps_ros.live.intake import DEPTH, IMAGE, JUMP_BACK_NS, STUBBORN, Intake
 from garps_ros.recording.bags import Bag

@@ -17,7 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from recordings import COVARIANCE, moved
 
 from garps_core.types import PoseEstimate, Status
-from garps_ros.live import estimator
+from garps_ros.live import jobs
 from garps_ros.live.node import PoseNode
 from msg_adapters import header_stamp_ns
 
@@ -93,7 +93,7 @@ def estimates(monkeypatch):
         found = PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9) if fault is None else fault()
         return found, None
 
-    monkeypatch.setattr(estimator, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(jobs, "estimate_with_mixtures", estimate)
     return Estimates
 
 
@@ -180,12 +180,12 @@ def test_what_is_not_fit_to_use_is_not_published(domain, estimates, estimate, st
     with inside(domain) as node:
         node.answer()
         node.peer.spin(0.3)
-        before, used = len(node.found), node.node._health.used
+        before, used = len(node.found), node.node._counts.used
         estimates.next = estimate
         node.send()
         assert node.says("estimates", status) == 1
-        assert len(node.found) == before and node.node._health.used == used
-        assert node.node._health.rejected.total() == 1
+        assert len(node.found) == before and node.node._counts.used == used
+        assert node.node._counts.rejected.total() == 1
 
 
 def test_a_loop_that_stalls_ends_the_process_and_says_where():
@@ -197,7 +197,7 @@ def test_a_loop_that_stalls_ends_the_process_and_says_where():
             def spin_once(self, timeout_sec):
                 stalled_in_here()
         class Node:
-            refusal = ""
+            start_error = ""
         def stalled_in_here():
             time.sleep(60)
         pose_node.STALL_S = 0.5

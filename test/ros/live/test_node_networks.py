@@ -10,7 +10,7 @@ import calm_network
 import numpy as np
 import pytest
 from graph import NodeProcess, room_pair
-from node_rig import Rig, assert_equal, finding, offline, running, values
+from node_rig import Rig, assert_equal, check, offline, running, values
 from places import ROOT
 from point_map_cases import Errors, point_maps, true_views
 from two_view_fixtures import RECORDED, installed_here, write_maps
@@ -41,7 +41,7 @@ def test_two_plain_images_give_the_offline_pose(networked, tmp_path, monkeypatch
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded depth_anything_v2 (weights {calm_network.NAME}) in " in node.log().split("ready")[0]
         shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert not {"source/depth", "target/depth"} & set(values(peer, "inputs"))
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
         assert values(peer, "machine")["scale from"] == f"depth_anything_v2 (weights {calm_network.NAME}), m"
@@ -57,7 +57,7 @@ def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
         before = node.log().split("ready")[0]
         assert "loaded demo_net (a demonstration: " in before and "demo_net is a demonstration: " in before
         shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"].startswith("demo_net (a demonstration: ")
     estimate = offline(shots, [], preset="demo_net")
     assert_equal(pose, estimate)
@@ -107,7 +107,7 @@ def test_an_adapter_gives_pose_and_depth_of_two_plain_images(domain, tmp_path, m
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded adapter {RECORDED} in " in node.log().split("ready")[0]
         shots, pose, odometry = Rig(peer, pair, depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"] == f"adapter {RECORDED} of every pair, m"
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
     off = se3_log(pose_from_message(pose)[0] @ se3_inverse(pair.T_1_0))

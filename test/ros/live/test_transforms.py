@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy
 from recordings import START, camera, moved
 from ros_messages import rclpy_class
 
-from garps_ros.live import estimator
+from garps_ros.live import jobs
 from garps_ros.live.intake import DEPTH, IMAGE
 from garps_ros.live.log import Log
 from garps_ros.live.node import PoseNode
@@ -206,7 +206,7 @@ def ros(monkeypatch, tmp_path):
 
 
 def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd):
-    monkeypatch.setattr(estimator, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
+    monkeypatch.setattr(jobs, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
     node = PoseNode(ros)
     executor = SingleThreadedExecutor(context=ros.context)
     executor.add_node(ros)
@@ -218,10 +218,10 @@ def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd)
                 node._image(index, IMAGE, image)
                 node._image(index, DEPTH, depth)
             limit = time.monotonic() + 20
-            while node._health.used < frame and time.monotonic() < limit:
+            while node._counts.used < frame and time.monotonic() < limit:
                 executor.spin_once(timeout_sec=0.05)
-        assert node._health.used == 3 and not node._health.rejected and not node._health.errors
-        assert node._health.facts["transform"] == "off"
+        assert node._counts.used == 3 and not node._counts.rejected and not node._counts.errors
+        assert node._publishers.transform == "off"
     finally:
         assert node.stop(10)
         executor.shutdown()
