@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`garps-replay`: relative poses from a recording, offline and without ROS; or the recording into a live ROS 2 graph.
+"""Command `garps-replay`: relative poses from a recording, without ROS; or the recording into a live ROS 2 graph.
 
 Exit code 0 = at least one pose, 1 = none, 2 = wrong input, 130 = interrupted (what was written is valid).
 """
@@ -47,7 +47,7 @@ ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
 ONE_OF_RECTIFIED = ("auto", "true", "false")
 GIVEN = "COMMANDLINE"
 LIVE_OPTIONS = {"rate", "loop", "topics", "wait"}
-"""What goes with --to-ros, and with nothing else."""
+"""Options that need --to-ros."""
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
@@ -56,7 +56,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code. A user's mistake is one line on stderr and code 2."""
+    """Run the command line; return the exit code. A user's mistake is one line on stderr and code 2."""
     try:
         code = app(args=arguments, prog_name=NAME, standalone_mode=False)
         return code if isinstance(code, int) else 0
@@ -182,7 +182,7 @@ def replay(
 
 
 def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
-    """The settings; of a network from the preset for its depth, where none is given."""
+    """Return the settings; where no preset is given, those of a network start from the preset for its depth."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
 
     def changed(base: Config) -> Config:
@@ -195,7 +195,7 @@ def _configured(preset: str | None, method: str | None, file: Path | None, chang
 
 
 def _check_given(context: typer.Context, to_ros: bool) -> None:
-    """Options of the one way to replay do not go with the other."""
+    """Refuse options of the offline replay with --to-ros, and the other way round."""
     given = {name for name in context.params if getattr(context.get_parameter_source(name), "name", "") == GIVEN}
     wrong = given - LIVE_OPTIONS - {"bag", "to_ros"} if to_ros else given & LIVE_OPTIONS
     if wrong:

@@ -15,12 +15,12 @@ from garps_core.types import PoseEstimate, View
 
 Estimator = Callable[[View, View], PoseEstimate]
 MIN_DEPTH_SHARE = 0.02
-"""A view with depth at a smaller share of its pixels begins no segment: a covered lens, not a sparse sensor."""
+"""Share of pixels with depth below which a view begins no segment; it tells a covered lens from a sparse sensor."""
 
 
 @dataclass(frozen=True)
 class KeyframeRule:
-    """When the camera is so far from its keyframe that a new one is taken.
+    """Limits beyond which a new keyframe is taken.
 
     Args:
         min_overlap: new keyframe when the overlap (0..1) falls below.
@@ -53,7 +53,7 @@ class Attempt:
 
 @dataclass(frozen=True, eq=False)
 class _Located:
-    """A view and the pose of its camera in the segment's first keyframe; covariance None = it is that keyframe."""
+    """A view with its camera's pose in the first keyframe of the segment; covariance None = it is that keyframe."""
 
     view: View
     T: Float64Array
@@ -75,14 +75,14 @@ class KeyframeTracker:
         self._last: _Located | None = None
         self._failures = 0
         self._was_blank = False
-        """Of the last view."""
+        """The last view had too little depth to begin a segment."""
         self.segment = segment
-        """Counts from 1; poses of different segments are not related to each other."""
+        """Number of the segment, from 1; poses of different segments are not related to each other."""
         self.keyframes = 0
 
     @property
     def keyframe_stamp_ns(self) -> int:
-        """Stamp of the present keyframe, 0 before the first."""
+        """Stamp of the present keyframe, ns; 0 before the first."""
         return 0 if self._keyframe is None else self._keyframe.view.stamp_ns
 
     def begins(self, view: View) -> bool:
@@ -156,7 +156,7 @@ def _depth_share(view: View) -> float:
 def composed_covariance(
     T_ab: Float64Array, covariance_ab: Float64Array | None, T_bc: Float64Array, covariance_bc: Float64Array
 ) -> Float64Array:
-    """6x6 covariance of T_ab @ T_bc in the ROS meaning, for independent errors; covariance_ab None = T_ab exact.
+    """Return the 6x6 covariance of T_ab @ T_bc (ROS meaning) for independent errors; covariance_ab None = T_ab exact.
 
     With p_ac = R_ab p_bc + p_ab, a small rotation w of T_ab moves p_ac by w x (R_ab p_bc).
     """

@@ -52,7 +52,7 @@ class PoseNode:
 
     def __init__(self, node: Node) -> None:
         self.start_error = ""
-        """Why it cannot become ready; the process must then end. "" while there is no such reason."""
+        """Error for which it cannot become ready and the process must end; "" = none."""
         self._node, self._log, self._is_ready = node, Log(node.get_logger()), False
         self._counts, self._priors = Counts(), Priors()
         self._diagnostics = Diagnostics(self._counts)

@@ -81,7 +81,7 @@ class Input:
             self._subscription = self._subscribe()
 
     def _needs_it(self) -> bool:
-        """Whether best effort is not enough, for a calibration must not be lost, or images are being lost."""
+        """Tell whether best effort is not enough: a calibration must not be lost, or images are being lost."""
         if self._once or self._qos.reliability == ReliabilityPolicy.RELIABLE:
             return True
         now_s = time.monotonic()

@@ -12,11 +12,12 @@ from garps_core import Prior
 from msg_adapters import PoseWriter, header_stamp_ns, pose_from_message
 
 pytest.importorskip("rclpy")
-from garps_ros.live.publishing import message_class
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
+
+from garps_ros.live.publishers import message_class
 
 TRANSPORTS = {
     "raw_offered_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=auto"]),
