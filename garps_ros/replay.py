@@ -145,7 +145,7 @@ def replay(
     keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
     keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
     keyframe_lost_after: Annotated[
-        int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
+        int, typer.Option(help="New trajectory after this many frames in a row without a pose.", min=1, max=1000)
     ] = 5,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Preset = None,

@@ -13,7 +13,8 @@ from garps_core.errors import ReconstructionError
 from garps_core.geometry import skew, so3_log
 from garps_core.types import PoseEstimate, View
 
-Estimator = Callable[[View, View], PoseEstimate]
+Estimate = Callable[[View, View], PoseEstimate]
+"""A function (source, target) -> pose of the source camera in the target camera."""
 MIN_DEPTH_SHARE = 0.02
 """Share of pixels with depth below which a view begins no segment; it tells a covered lens from a sparse sensor."""
 
@@ -69,7 +70,7 @@ class KeyframeTracker:
         segment: the last one of an earlier tracker, to count on from.
     """
 
-    def __init__(self, estimate: Estimator, rule: KeyframeRule, segment: int = 0) -> None:
+    def __init__(self, estimate: Estimate, rule: KeyframeRule, segment: int = 0) -> None:
         self._estimate, self.rule = estimate, rule
         self._keyframe: _Located | None = None
         self._last: _Located | None = None
@@ -99,7 +100,7 @@ class KeyframeTracker:
                 f"the view has depth at {share:.1%} of its pixels: expected at least {self.rule.min_depth_share:.0%} "
                 "to begin a trajectory; uncover the camera, or check the depth topic"
             )
-        # What was out of sight may be back after a blank view: the keyframe gets one more try.
+        # A covered lens may be uncovered by now: after a blank view the keyframe gets one more try.
         patience = self.rule.lost_after + self._was_blank
         if self._keyframe is not None and (self._failures < patience or share < self.rule.min_depth_share):
             return False

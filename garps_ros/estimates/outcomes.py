@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
-from garps_ros.estimates.keyframes import Estimator, KeyframeTracker
+from garps_ros.estimates.keyframes import Estimate, KeyframeTracker
 from garps_ros.frames.frame import Frame, frame_warning, view_from_messages
 from msg_adapters import MessageError, header_frame_id
 
@@ -44,7 +44,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Origin:
-    """The beginning of a trajectory; with a stamp (ns), its first pose is the identity at that time."""
+    """The start of a trajectory; with a stamp (ns), its first pose is the identity at that time."""
 
     segment: int
     frame_id: str
@@ -108,7 +108,7 @@ class ViewReader:
 
 
 def estimate_pairs(
-    pairs: Iterable[tuple[Frame, Frame]], reader: ViewReader, estimate: Estimator
+    pairs: Iterable[tuple[Frame, Frame]], reader: ViewReader, estimate: Estimate
 ) -> Iterator[Origin | Outcome]:
     """Estimate the pose of the first camera of each pair (source) in the second (target)."""
     begun = False
@@ -120,7 +120,7 @@ def estimate_pairs(
         yield outcome
 
 
-def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimator) -> Outcome:
+def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimate) -> Outcome:
     """Estimate the pose of the source camera in the target camera; the outcome says why there is none."""
     began = time.perf_counter()
     source_name, target_name = names = frame_names(source, target)

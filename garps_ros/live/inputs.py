@@ -67,5 +67,5 @@ def _sides(settings: NodeSettings) -> tuple[str, ...]:
 
 
 def _transported(node: Node, name: str, transport: str) -> tuple[Any, str]:
-    """Return type and topic of an image in a transport; names are remapped without the suffix, as in image_transport."""
+    """Return type and topic of an image in a transport; names are remapped without suffix, as image_transport does."""
     return (Image, name) if transport == "raw" else (CompressedImage, f"{node.resolve_topic_name(name)}/{transport}")

@@ -211,13 +211,13 @@ class PoseNode:
         self._forget(f"the clock went back by {-jump.delta.nanoseconds * 1e-9:.3f} s")
 
     def _forget(self, why: str) -> None:
-        """Begin anew: drop the keyframe, waiting frames and all earlier results."""
+        """Start anew: drop the keyframe, waiting frames and all earlier results."""
         self._epoch += 1
         self._priors.forget()
         self._diagnostics.forget()
         self._counts.restart(why)
         self._drop_results()
-        self._log.warn("forget", f"{why}: beginning anew")
+        self._log.warn("forget", f"{why}: starting anew")
 
     def _drop_results(self) -> None:
         """Drop the job that waits, and the result of the one that is being computed."""

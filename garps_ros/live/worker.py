@@ -34,7 +34,7 @@ class Worker(Generic[Job, Result]):
         self._busy_since: float | None = None
         self._results: deque[Result] = deque()
         self.min_period_s = 0.0
-        """Shortest time between the beginnings of two jobs, s; a change counts from the next offer on."""
+        """Shortest time between the starts of two jobs, s; a change counts from the next offer on."""
         self.death = ""
         """Reason why the thread ended although nobody stopped it; "" while it lives."""
         self.error: BaseException | None = None

@@ -39,7 +39,7 @@ TICK_S = 0.008
 LEAD_S = 0.1
 """Wall time that /clock runs before the first message, s."""
 LATE_S = 0.2
-"""Wall time behind the recording from which on a line says so, s."""
+"""Wall time behind the recording from which on a line is written, s."""
 SETTLE_S = 0.6
 """Time without a new subscription after which the listeners count as complete, s: they are matched one after another,
 and `pose_node`, which looks at the publishers every 0.2 s, then subscribes anew with the QoS that they offer."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Without depth topics: one pass of the network per frame, live as in a replay as offline; what is refused before."""
+"""Cameras without depth topics: the network runs once per frame, live and offline; wrong settings are refused."""
 
 import csv
 
@@ -38,14 +38,14 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def installed(weights, monkeypatch):
-    """The network is there, and looks at small pictures."""
+    """The network is installed, and takes small pictures."""
     monkeypatch.setenv("GARPS_WEIGHTS", str(weights))
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 140)
 
 
 @pytest.fixture
 def passes():
-    """How many pictures enter the network, pass by pass."""
+    """Number of pictures that enter the network, pass by pass."""
     entered = []
     hook = in_use.depth_network("", "any").register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
     yield entered

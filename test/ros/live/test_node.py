@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pose_node as a process on a real graph: what goes in by topic comes out as the pose the offline path finds."""
+"""The process pose_node on a real graph: topics in, and out comes the pose that the offline path finds."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the running node says of its inputs: missing, lost, of another type or QoS, never together; and time."""
+"""The checks of a running node on its inputs: missing, lost, of another type or QoS, never together; and time."""
 
 import re
 
@@ -37,7 +37,7 @@ def test_with_simulated_time_and_a_recording_that_begins_again(domain, tmp_path)
         for step in range(4):
             play(step + 0.5)
         peer.wait(lambda: rig.answers(start + round(3.5 * SECOND)), what="a pose after the jump back")
-        assert re.search(r"(went back|time went back) by .*beginning anew", node.log())
+        assert re.search(r"(went back|time went back) by .*starting anew", node.log())
         peer.wait(lambda: "went back" in values(peer, "estimates")["began anew"], what="the restart in the diagnostics")
 
 

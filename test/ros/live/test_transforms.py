@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms leave the tree whole: no second parent, no loop; without tf2_msgs the node says so once and works.
+"""Transforms leave the tree whole: no second parent, no loop; without tf2_msgs the node writes one line and works.
 
 tf2_msgs is part of ROS but of no package index, and a message class needs its compiled support. So its TFMessage and
 the topics that carry it are stand-ins of the same shape here; the transforms in it are real ones.
@@ -108,7 +108,7 @@ def test_the_same_parent_by_somebody_else_is_a_second_answer(topics, transforms,
 
 @pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf", START + 1), ("/tf_static", START)])
 def test_the_same_transform_as_ours_from_somebody_else_is_told_from_the_echo(topics, transforms, topic, stamp_ns):
-    """On /tf by its stamp; a latched one may well have the stamp of ours."""
+    """An echo on /tf is known by its stamp; a latched transform may have the same stamp as ours."""
     assert transforms.send(moved(0.25), START, "left", "right") == ""
     topics.other("left", "right", topic, stamp_ns)
     assert "already has the parent left" in transforms.send(moved(0.25), START + 2, "left", "right")
@@ -163,7 +163,7 @@ def test_a_loop_that_others_made_does_not_hang_us(topics, transforms):
     assert transforms.send(moved(0.25), START, "a", "c") == ""
 
 
-def test_the_refusal_is_written_once_and_not_with_every_pose(topics):
+def test_the_reason_is_written_once_and_not_with_every_pose(topics):
     lines = []
     log = Log(SimpleNamespace(warning=lines.append))
     transforms = Transforms(topics, PoseWriter(rclpy_class), partial(log.warn, "tf"))

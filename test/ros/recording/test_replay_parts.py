@@ -206,7 +206,7 @@ def view(index, share=1.0):
 
 
 def followed(tracker, views):
-    """For each view: "begins", "pose", "none" or the error."""
+    """Return one word per view: "begins", "pose", "none" or the error."""
     said = []
     for each in views:
         try:
@@ -244,7 +244,7 @@ def test_only_a_view_with_depth_begins_a_trajectory(blank):
 
 
 def test_a_hand_over_the_lens_does_not_end_the_trajectory():
-    """However long, also where it made usable views fail before."""
+    """A cover may last for any time, also where it made usable views fail before."""
     bad = {*range(3, 6), *range(10, 40)}
     tracker = KeyframeTracker(lambda s, t: estimate(s, t, bad=bad), KeyframeRule(max_motion_m=99, lost_after=3))
     hand = {4, *range(12, 40)}
@@ -352,7 +352,7 @@ def test_a_view_is_undistorted_together_with_its_depth():
     assert np.isnan(made.depth[0, 0]) and made.depth[24, 32] == 1 and (made.rgb[0, 0] == 0).all()
 
 
-def test_a_view_without_depth_has_none_and_foreign_depth_or_calibration_is_doubted():
+def test_a_view_without_depth_has_none_and_foreign_depth_or_calibration_is_a_warning():
     rgb, depth = image(picture(3), "rgb8"), image(np.full((48, 64), 900, np.uint16), "16UC1", frame_id="ir")
     assert view_from_messages(rgb, camera_info())[0].depth is None
     assert frame_warning(rgb, camera_info()) == ""
