@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the README and docs/ say is true: their code runs, their commands, options, settings, paths and links exist."""
+"""README and docs/ are true: their code runs, their commands, options, settings, paths and links exist."""
 
 import ast
 import importlib.util
@@ -50,7 +50,7 @@ def spoken(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """a.png, b.png and their depths, rendered with the README's K; and the true T_b_a."""
+    """Folder of a.png, b.png and their depths, rendered with the README's K; and the true T_b_a."""
     pytest.importorskip("trimesh")
     from bench.rooms import make_pair, make_room
 
