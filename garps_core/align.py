@@ -91,7 +91,7 @@ class Estimator:
             config = with_wider_errors(config, *views)
             source, target = mixtures_of(with_depths, config, networks)
             stages.end("reconstruct")
-            starts = initialise(*with_depths, config, prior, networks, maps)
+            starts = initialise(with_depths[0], with_depths[1], config, prior, networks, maps)
             stages.end("initialise")
         except InitialisationError as failure:
             stages.end("initialise")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ladders narrow from rung to rung and take more components; their numbers are named."""
 
+from itertools import pairwise
+
 import pytest
 
 from garps_core.config import PRESETS, Config, Rung
@@ -15,7 +17,7 @@ def test_the_numbers_of_a_rung_are_named() -> None:
 @pytest.mark.parametrize("ladder", ["ladder", "search", "search_ladder"])
 def test_a_ladder_narrows_and_takes_more_components(preset: str, ladder: str) -> None:
     rungs = getattr(Config.preset(preset).alignment, ladder)
-    for wide, narrow in zip(rungs, rungs[1:], strict=False):
+    for wide, narrow in pairwise(rungs):
         assert (
             narrow.covariance_scale < wide.covariance_scale
             or narrow.blur_m < wide.blur_m

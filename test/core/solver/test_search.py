@@ -95,14 +95,14 @@ def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeyp
 def test_a_convincing_solution_ends_the_search(monkeypatch):
     source, target, _ = room(1, 4)
     mixtures = [reconstruct(view) for view in (source, target)]
-    start, followed, searched = identity(Config(), ""), {}, align.search
+    start, followed, searched = identity(Config(), ""), {}, mixture_alignment.search
 
     def counted(*given):
         for solution in searched(*given):
             followed[enough] = followed.get(enough, 0) + 1
             yield solution
 
-    monkeypatch.setattr(align, "search", counted)
+    monkeypatch.setattr(mixture_alignment, "search", counted)
     for enough in (-1.0, 1.0):
         config = Config().replace({"alignment.enough_correlation": enough, "alignment.brightness_measurements": 0.05})
         estimate = align_mixtures(*mixtures, start, config)
@@ -119,8 +119,8 @@ def test_poses_that_lie_together_are_one():
 def test_a_precise_start_is_not_searched_from(monkeypatch):
     """What decides is how far scene points may be off, as a share of their range."""
     mixtures, calls = two_mixtures(), []
-    searched = align.search
-    monkeypatch.setattr(align, "search", lambda *given: calls.append(given) or searched(*given))
+    searched = mixture_alignment.search
+    monkeypatch.setattr(mixture_alignment, "search", lambda *given: calls.append(given) or searched(*given))
     assert align_mixtures(*mixtures, disturbed()).ok and not calls
     assert align_mixtures(*mixtures, disturbed(covariance=16 * FREE)).ok and len(calls) == 1
 
