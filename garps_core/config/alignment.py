@@ -34,19 +34,7 @@ class Alignment(Checked):
     outlier_floor: float = setting(
         0.003, "outlier density, in densities of one perfect partner", unit="", low=0, high=10
     )
-    depth_weight: float = setting(
-        1.0,
-        "1 = nearest in space; below 1 = nearest in the other camera's image, with the logarithm of depth times this",
-        low=1e-3,
-        high=1,
-    )
-    max_distance_m: float = setting(
-        2.5,
-        "partners further apart are ignored; has no metres to compare, and so no say, with depth_weight below 1",
-        unit="m",
-        low=1e-3,
-        high=1000,
-    )
+    max_distance_m: float = setting(2.5, "partners further apart are ignored", unit="m", low=1e-3, high=1000)
     occlusion_ratio: float = setting(
         0.1, "drop components further behind the other view's depth than this share", unit="", low=0, high=10
     )

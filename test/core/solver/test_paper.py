@@ -101,7 +101,7 @@ def test_the_numbers_are_the_published_ones():
     assert (settings.opacity_threshold, settings.component_stride) == (0.5, 32)
     assert (rung.neighbours, settings.max_distance_m) == (30, 2.5)
     assert (settings.adam_rate_translation, settings.adam_rate_rotation) == (9e-5, 3e-6)
-    assert settings.solver == "adam" and settings.depth_weight == 1 and PAPER.lifting.weighting == "equal"
+    assert settings.solver == "adam" and PAPER.lifting.weighting == "equal"
 
 
 def test_candidate_pairs_are_the_published_ones(pairs, published):
