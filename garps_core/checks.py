@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of what comes from outside: calibrations, rigid motions, covariances."""
+"""Checks of input: calibrations, rigid motions, covariances."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def checked_covariance(name: str, covariance: Any) -> Float64Array:
     if C.shape != (6, 6):
         raise InputError(f"{name} has shape {C.shape}: expected 6x6 (x, y, z in m; rotations about X, Y, Z in rad)")
     if not np.isfinite(C).all():
-        raise InputError(f"{name} holds NaN or infinity: expected finite variances; use a large one for unknown")
+        raise InputError(f"{name} holds NaN or infinity: expected finite variances; use large ones for unknown")
     if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
         raise InputError(f"{name} is not symmetric: largest difference {np.abs(C - C.T).max():.3g}, expected 0")
     smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     if smallest <= 0:
         raise InputError(
             f"{name} is not positive definite: smallest eigenvalue {smallest:.3g}, expected above 0; "
-            "zeros do not mean unknown, give every direction a positive variance"
+            "zeros do not mean unknown; give every direction a positive variance"
         )
     return 0.5 * (C + C.T)
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that all pixels of one view share, and so do not average out.
+"""Errors that all pixels of one view share. They do not average out as noise does.
 
-Noise is not all: a depth map may be off in scale and smoothly warped, and a calibration's principal point is off by a
-fraction of a pixel. Eight modes of one view stand for them, each a field of displacements of its points p:
+A depth map may be off in scale and smoothly warped, and a calibrated principal point by a fraction of a pixel.
+Eight modes of one view stand for these errors, each a field of displacements of its points p:
 
     0..5  p times the polynomials 1, x, y, x^2, xy, y^2 of the ray's slopes, scaled to about +-1 across the image:
           relative depth error; the first is the scale
-    6, 7  z times the x and y axes: the direction in which the camera believes a pixel to look, in rad
+    6, 7  z times the x and y axes: error of the direction of a pixel's ray, in rad
 
-Depth errors may be solved for together with the pose (`with_depth_errors.py`). What one sigma of every mode that is not
-does to the pose is added to the pose's covariance.
+Depth errors may be solved for together with the pose (`with_depth_errors.py`). The effect of one sigma of
+every other mode is added to the covariance of the pose.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from garps_core.geometry import Array
 FIELD_SLOPE = 0.6
 """Slope |x/z| at the image border that the depth modes are scaled to (about a 62 degree field of view)."""
 LARGEST = 3.0
-"""Slopes, in field slopes, beyond which the polynomials are held: no camera's image, but any mixture may be given."""
+"""Largest slope, in field slopes, of the polynomials; mixtures may reach beyond the image of any camera."""
 DEPTH_MODES = 6
+"""Number of modes that are depth errors; they come first."""
 
 
 def depth_modes(points: Tensor) -> Tensor:
@@ -45,7 +46,7 @@ def error_fields(points: Array) -> Array:
 
 
 def error_sigmas(lifting: Lifting) -> Array:
-    """Sigmas (8,) of the modes."""
+    """Sigmas (8,) of the modes: relative depth, then rad."""
     return np.array([lifting.scale_sigma] + [lifting.warp_sigma] * 5 + [lifting.pointing_sigma_rad] * 2)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where torch computes: a device by its name, checked before anything is moved to it."""
+"""Devices of torch: a device by its name, checked before anything is moved to it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def checked_device(name: str) -> torch.device:
-    """The device `name`. Raises ConfigError when it is none, or not there."""
+    """Return the device `name`. Raises ConfigError when there is no such device."""
     try:
         device = torch.device(name)
         if device.type in ("cpu", "cuda"):

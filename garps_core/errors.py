@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every error this package raises on purpose. Each text says what was given, what was expected, what to do."""
+"""Every error that this package raises on purpose. A text says what was given, what was expected and what to do."""
 
 
 class GarpsError(Exception):
@@ -7,7 +7,7 @@ class GarpsError(Exception):
 
 
 class InputError(GarpsError, ValueError):
-    """An image, calibration, prior or mixture that cannot be what it claims to be."""
+    """An image, calibration, prior or mixture that is not valid."""
 
 
 class ConfigError(GarpsError, ValueError):
@@ -19,7 +19,7 @@ class ReconstructionError(GarpsError):
 
 
 class InitialisationError(GarpsError):
-    """No initial pose: too few feature matches fit one pose and no other start is allowed."""
+    """No starting pose: too few feature matches fit one pose and no other start is allowed."""
 
 
 class ModelError(GarpsError):

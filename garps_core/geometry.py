@@ -119,7 +119,7 @@ def twist_from_ros(covariance: Array, T: Array) -> Array:
 
 
 def inverted(covariance: Array, T: Array) -> Array:
-    """Covariance (ROS meaning) of T^-1, given that of T: what swapping source and target does."""
+    """Covariance (6x6, ROS meaning) of T^-1, given that of T; source and target are swapped."""
     inverse = se3_inverse(T)
     A = adjoint(inverse)
     return ros_from_twist(A @ twist_from_ros(covariance, T) @ A.T, inverse)

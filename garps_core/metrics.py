@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an estimated relative pose is from the truth, in float64.
+"""Errors of an estimated relative pose against the truth, in float64.
 
 Poses are 4x4, source-camera points into the target camera (metres). Nothing here looks at images: the same numbers can
 be computed for any method. The difference of translations is that of the source origin as the target camera sees it.
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from garps_core.geometry import so3_log
 
 CHI2_6_95 = 12.591587243743977
-"""95 % quantile of the chi-square distribution with 6 degrees of freedom: what an honest `nees` stays under."""
+"""95 % quantile of the chi-square distribution with 6 degrees of freedom: the bound of an honest `nees`."""
 
 
 def rotation_error_deg(T_est: npt.ArrayLike, T_true: npt.ArrayLike) -> float:
@@ -56,9 +56,9 @@ def scale_ratio(T_est: npt.ArrayLike, T_true: npt.ArrayLike) -> float:
 
 
 def pose_error(T_est: npt.ArrayLike, T_true: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """What takes the estimate to the truth, (6,): t_true - t_est in m, then the rotation vector of R_true R_est^T, rad.
+    """Error (6,) of a pose: t_true - t_est in m, then the rotation vector of R_true R_est^T in rad.
 
-    Both in the target frame, so it is the error that a covariance in ROS order and meaning describes.
+    Both are in the target frame, so a covariance in ROS order and meaning describes this error.
     """
     estimate, truth = _pose(T_est), _pose(T_true)
     return np.concatenate([truth[:3, 3] - estimate[:3, 3], so3_log(truth[:3, :3] @ estimate[:3, :3].T)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3D Gaussian mixture of one view, and what its camera could see."""
+"""The 3D Gaussian mixture of one view, and the frustum of its camera."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from garps_core.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Frustum:
-    """What the camera behind a mixture could see: image bounds, a coarse depth map and its brightness.
+    """The part of space that the camera of a mixture saw: image bounds, coarse depth map and brightness.
 
     Args:
         K: 3x3 pixels of the depth map's own grid.
         depth: hxw float32 metres, NaN = unknown (then nothing is called hidden there).
-        brightness: hxw float32 0..1 on the same grid; None = not known, then the pose is not sharpened by it.
+        brightness: hxw float32 0..1 on the same grid; None = unknown, then the pose is not fitted to it.
         patch_sigma: relative error of the depth that differs from place to place (`lifting.patch_sigma`).
     """
 
@@ -40,7 +40,7 @@ class Mixture:
         weights: N, non-negative, not all zero (relative; any scale).
         colours: Nx3 in 0..1.
         labels: N integers (semantic class), or None.
-        frustum: what the camera could see; None turns the visibility test off.
+        frustum: what the camera saw; None turns the visibility test off.
     Raises:
         InputError: wrong shape, dtype, NaN, indefinite covariance.
     """
@@ -93,7 +93,7 @@ def _checked_component(name: str, value: Any, shape: tuple[int, ...]) -> FloatAr
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(f"{name} hold NaN or infinity: expected finite numbers, drop those components first")
+        raise InputError(f"{name} hold NaN or infinity: expected finite numbers; drop those components first")
     return array
 
 
@@ -114,5 +114,5 @@ def _check_component_values(mixture: Mixture) -> None:
         bad = int(smallest.argmin())
         raise InputError(
             f"covariances are indefinite: component {bad} has eigenvalue {smallest[bad]:.3g} m^2; "
-            "expected positive definite, add a small variance to the diagonal"
+            "expected positive definite; add a small variance to the diagonal"
         )

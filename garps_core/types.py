@@ -125,12 +125,12 @@ class Prior:
 
 
 class Status(enum.Enum):
-    """How an estimate ended. Only `CONVERGED` is meant to be used without a second look."""
+    """Outcome of an estimate. Only `CONVERGED` is meant to be used without further checks."""
 
     CONVERGED = "converged"
     MAX_ITERATIONS = "max_iterations"  #: a pose is given, the last step was still larger than the tolerance
     DEGENERATE = "degenerate"  #: a pose is given, but the views leave a direction open; see the covariance
-    INCONSISTENT = "inconsistent"  #: the data pulls further from the initial pose than its covariance allows
+    INCONSISTENT = "inconsistent"  #: the data pulls further from the starting pose than its covariance allows
     POOR_FIT = "poor_fit"  #: too few partners, or brightness disagrees: most likely a wrong optimum; a pose is given
     LOW_OVERLAP = "low_overlap"  #: too few components of one view are visible in the other
     NO_MIXTURE = "no_mixture"  #: a network could not do its part: too little memory, or values that are not finite
@@ -139,10 +139,10 @@ class Status(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """The answer, or why there is none.
+    """Estimated pose with its status, or the reason why there is none.
 
-    `T_target_source` (4x4 float64) and `covariance` (6x6, ROS order and meaning) are None when the status says
-    that no pose could be had: there is no identity in disguise.
+    `T_target_source` (4x4 float64) and `covariance` (6x6, ROS order and meaning) are None when the status says that
+    no pose was found; the identity never stands for a missing pose.
     """
 
     status: Status
@@ -156,15 +156,15 @@ class PoseEstimate:
     objective: float = float("nan")
     """Final value of the objective; comparable only between runs on the same mixtures and Config."""
     quality: float = 0.0
-    """How likely the pose is right to 5 cm and 2 deg, 0..1, from its covariance and fit: to gate on and to rank by."""
+    """Probability (0..1) that the pose is right to 5 cm and 2 deg, from covariance and fit; to gate and to rank by."""
     agreement: float = float("nan")
-    """Correlation of the views' brightness under this pose times the share that both see; NaN where not known."""
+    """Correlation of the views' brightness under this pose times the share that both see; NaN where unknown."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time per stage: depth (the network's), reconstruct, initialise, align."""
     estimated_fx_px: tuple[float | None, float | None] = (None, None)
     """Focal lengths of source and target where they are a network's estimate; None = the intrinsics were given."""
     depth_from: str = "given"
-    """Where the views' depth comes from, for people; "given" = with the views, or by whoever made the mixtures."""
+    """Source of the views' depth, for people; "given" = with the views, or by whoever made the mixtures."""
 
     @property
     def ok(self) -> bool:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well two views agree under a pose."""
+"""The objective: the agreement of two views under a pose, by shape and by brightness."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sharpen a pose by brightness: what one camera measured in 3D, the other must see equally bright where it projects.
+"""Direct (photometric) alignment: a point that one camera measured in 3D looks equally bright to the other camera.
 
 No features and no correspondences are needed, and depth errors hardly matter: a point whose depth is off by a few per
 cent moves in the other image by that share of the parallax only, not of the depth. The basin is small, a few pixels of
 the coarsest grid, so this comes after the mixtures are aligned, whose result is the prior:
 
-    minimise  information / 2 * sum rho((I_y(pi(T p)) - gain I_x(p) - offset) / sigma)  +  r' Lambda r / 2
+    minimise  measurements / 2 * sum rho((I_y(pi(T p)) - gain I_x(p) - offset) / sigma)  +  r' Lambda r / 2
 
 Both directions count. Gain and offset absorb the exposure, sigma is the residuals' own spread, rho is Tukey's
 biweight. Where a view's depth is off from place to place (`Frustum.patch_sigma`), the brightness that this changes at a
@@ -31,32 +31,35 @@ from garps_core.mixtures.edges import GRID_EDGE_RATIO, away_from_edges
 from garps_core.objective.visibility import SAME_SURFACE_RATIO, surface_at
 
 GRIDS = (8, 4, 2, 1)
-"""Every n-th cell of the frustum's grid, coarse to fine: a basin of some pixels of the first."""
+"""Strides through the cells of the frustum's grid, coarse to fine. The basin is a few cells of the coarsest grid."""
 STEPS = 6
+"""Gauss-Newton steps on every grid."""
 MAX_POINTS = 6000
-"""Points per direction, those with the strongest gradients."""
+"""Largest number of points per direction; those with the strongest gradients are used."""
 MIN_POINTS = 100
+"""Smallest number of points per direction that must fall into the other image."""
 NEAREST_M = 0.05
-"""Points nearer to the other camera than this are left out, m: their pixels move too fast to be followed."""
+"""Smallest distance of a point from the other camera, m; nearer points are left out."""
 MIN_CONTRAST = 0.02
 """Standard deviation of the brightness (of 0..1) below which there is nothing to compare."""
 TUKEY = 4.0
+"""Residuals of more sigmas than this are outliers, of weight 0 (Tukey's biweight)."""
 SMALLEST_SIGMA = 2e-3
-"""Share of full brightness; 8-bit images are not more precise."""
+"""Smallest sigma of the residuals, in shares of full brightness; 8-bit images are not more precise."""
 
 
 @dataclass(frozen=True)
 class BrightnessFit:
-    """Pose T (4x4) and its covariance (6x6, left twist), and how well brightness agrees there."""
+    """Pose T (4x4), its covariance (6x6, left twist), and the agreement of brightness at that pose."""
 
     T: Array
     covariance: Array
     correlation: float
-    """Of the brightness of points and of the pixels they fall on, -1..1, the smaller of both directions."""
+    """Correlation (-1..1) of points and the pixels they fall on, the smaller of both directions."""
     share: float
     """Share (0..1) of the points that the other camera sees, the smaller of both directions."""
     kept: Array = field(default_factory=lambda: np.eye(6))
-    """(6, 6) what is left of an error of the prior: the left twist it becomes in T."""
+    """Matrix (6, 6) that takes an error of the prior, a left twist, to the error of T that remains of it."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class _Overlay:
-    """Points of one view that fall on pixels of the other: which, where (m and pixels), and both brightnesses."""
+    """Points of one view that fall on pixels of the other: mask, places (m and pixels), and both brightnesses."""
 
     inside: npt.NDArray[np.bool_]
     moved: Array
@@ -94,48 +97,50 @@ class Comparison:
     information: Array
     gradient: Array
     of_depth: Array
-    """(6, 8) gradient per unit of each error that the points may share (`depth_errors.py`)."""
+    """Gradient (6, 8) per unit of each error that the points may share (`depth_errors.py`)."""
     correlation: float
     share: float
 
 
 def fit_brightness(
-    source: Frustum, target: Frustum, T: Array, covariance: Array, information: float, sigmas: Array
+    source: Frustum, target: Frustum, T: Array, covariance: Array, measurements: float, sigmas: Array
 ) -> BrightnessFit | None:
-    """The pose where brightness and the prior agree best; None where too little is seen, or a view has no brightness.
+    """Fit a pose to the brightness of both views and to a prior.
 
     Args:
         source, target: what the two cameras saw.
-        T: 4x4 prior. covariance: its 6x6, left twist.
-        information: independent measurements per point of the finest grid; 0 = only compare, at T.
-        sigmas: (8,) of the errors that a view's points share; what they do to the pose is added to its covariance.
+        T, covariance: 4x4 prior, and its 6x6 covariance over the left twist.
+        measurements: independent measurements per point of the finest grid; 0 = only compare, at T.
+        sigmas: (8,) of the errors that a view's points share; their effect on the pose is added to its covariance.
+    Returns:
+        The fit; None when a view has no brightness, or the views have too few points or too little contrast in common.
     """
     if source.brightness is None or target.brightness is None:
         return None
-    if information <= 0:
+    if measurements <= 0:
         return _only_compared(source, target, T, covariance)
     precision, at = np.asarray(np.linalg.inv(covariance), np.float64), T
     for step in GRIDS:
         x, y = grid_of(source, step), grid_of(target, step)
-        at = climb_on(x, y, at, T, precision, 0.5 * information * step**2, STEPS)
-    seen = both_ways(x, y, at)
-    if seen is None:
+        at = climb_on(x, y, at, T, precision, 0.5 * measurements * step**2, STEPS)
+    both = comparisons(x, y, at)
+    if both is None:
         return None
-    f, b = seen
-    weight = 0.5 * information
-    held = np.linalg.inv(weight * summed(f, b, at)[0] + precision)
-    B, spread = -adjoint(se3_inverse(at)), held.copy()
-    for pull in (f.of_depth, B.T @ b.of_depth):
-        effect = held @ (weight * pull) * sigmas
+    f, b = both
+    weight = 0.5 * measurements
+    inverse = np.linalg.inv(weight * summed(f, b, at)[0] + precision)
+    B, spread = -adjoint(se3_inverse(at)), inverse.copy()
+    for gradient in (f.of_depth, B.T @ b.of_depth):
+        effect = inverse @ (weight * gradient) * sigmas
         spread += effect @ effect.T
     agreement = min(f.correlation, b.correlation), min(f.share, b.share)
-    return BrightnessFit(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(held @ precision))
+    return BrightnessFit(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(inverse @ precision))
 
 
 def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
-    """Gauss-Newton steps on one pair of grids from pose `at`, held by a prior at T with the given precision (6, 6)."""
+    """Take Gauss-Newton steps on one pair of grids from pose `at`, with a prior at T of the given precision (6, 6)."""
     for _ in range(steps):
-        seen = both_ways(x, y, at)
+        seen = comparisons(x, y, at)
         if seen is None:
             break
         H, g = summed(*seen, at)
@@ -154,8 +159,8 @@ def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array
 
 @lru_cache(maxsize=16)
 def grid_of(view: Frustum, step: int) -> Grid:
-    """Every `step`-th cell of what a camera saw; kept, because a search asks for the same again and again."""
-    assert view.brightness is not None  # noqa: S101 - `fit_brightness` has looked
+    """Take every `step`-th cell of a frustum; cached, because a search asks for the same grid many times."""
+    assert view.brightness is not None  # noqa: S101 - `fit_brightness` has checked
     image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
     image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step], np.float32)
     depth = np.ascontiguousarray(view.depth[step // 2 :: step, step // 2 :: step])
@@ -172,8 +177,8 @@ def grid_of(view: Frustum, step: int) -> Grid:
     return Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float), view.patch_sigma)
 
 
-def both_ways(x: Grid, y: Grid, T: Array) -> tuple[Comparison, Comparison] | None:
-    """x under T against y, and y under the inverse against x; None when too little can be compared."""
+def comparisons(x: Grid, y: Grid, T: Array) -> tuple[Comparison, Comparison] | None:
+    """Compare x under T with y, and y under the inverse of T with x; None when too little can be compared."""
     f = _compared(x, y, T)
     b = None if f is None else _compared(y, x, se3_inverse(T))
     return None if f is None or b is None else (f, b)
@@ -186,7 +191,7 @@ def summed(f: Comparison, b: Comparison, T: Array) -> tuple[Array, Array]:
 
 
 def _overlaid(x: Grid, y: Grid, T: Array) -> _Overlay | None:
-    """Points of x on the pixels of y that they fall on; None when too few do, or all look alike."""
+    """Lay the points of x over the pixels of y; None when too few fall on any, or there is too little contrast."""
     moved = x.points @ T[:3, :3].T + T[:3, 3]
     pixel = _pixels_of(moved, y)
     inside = np.isfinite(pixel[:, 0])
@@ -201,23 +206,23 @@ def _overlaid(x: Grid, y: Grid, T: Array) -> _Overlay | None:
 
 def _compared(x: Grid, y: Grid, T: Array) -> Comparison | None:
     """Normal equations of the points of x against the pixels of y; None when too little can be compared."""
-    seen = _overlaid(x, y, T)
-    if seen is None:
+    overlay = _overlaid(x, y, T)
+    if overlay is None:
         return None
-    slope_x, slope_y = (_sampled(image, *seen.pixel.T) for image in (y.slope_x, y.slope_y))
-    exposure = np.stack([seen.own, np.ones_like(seen.own)], axis=1)
-    z = seen.moved[:, 2]
+    slope_x, slope_y = (_sampled(image, *overlay.pixel.T) for image in (y.slope_x, y.slope_y))
+    exposure = np.stack([overlay.own, np.ones_like(overlay.own)], axis=1)
+    z = overlay.moved[:, 2]
     a, b = slope_x * y.K[0, 0] / z, slope_y * y.K[1, 1] / z
-    slope = np.stack([a, b, -(a * seen.moved[:, 0] + b * seen.moved[:, 1]) / z], axis=1)  # brightness per metre
-    by_depth = (slope * (x.points[seen.inside] @ T[:3, :3].T)).sum(1)  # brightness per unit of relative depth error
-    error, weights = _robust(seen.theirs, exposure, np.square(x.patch_sigma * by_depth))
-    J = np.concatenate([slope, np.cross(seen.moved, slope)], axis=1)
+    slope = np.stack([a, b, -(a * overlay.moved[:, 0] + b * overlay.moved[:, 1]) / z], axis=1)  # brightness per metre
+    by_depth = (slope * (x.points[overlay.inside] @ T[:3, :3].T)).sum(1)  # brightness per unit of relative depth error
+    error, weights = _robust(overlay.theirs, exposure, np.square(x.patch_sigma * by_depth))
+    J = np.concatenate([slope, np.cross(overlay.moved, slope)], axis=1)
     weighted = exposure * weights[:, None]
     J = J - exposure @ np.linalg.solve(weighted.T @ exposure + 1e-9 * np.eye(2), weighted.T @ J)  # exposure is free
     JW = (J * weights[:, None]).T
-    fields = T[:3, :3] @ error_fields(x.points[seen.inside])
+    fields = T[:3, :3] @ error_fields(x.points[overlay.inside])
     of_depth = JW @ np.einsum("ni,nik->nk", slope, fields)
-    return Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
+    return Comparison(JW @ J, -JW @ error, of_depth, overlay.correlation, overlay.share)
 
 
 def _pixels_of(moved: Array, y: Grid) -> Array:

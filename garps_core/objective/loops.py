@@ -28,11 +28,11 @@ AVAILABLE = numba is not None
 ROWS = 128
 """Rows handled at a time: the scratch of 36 planes stays in a core's first-level cache."""
 FINITE_MATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
-"""Liberties the compiler may take; not the one that forgets infinities, which mean "no partner"."""
+"""Liberties the compiler may take. It must keep infinities, which mean "no partner"."""
 
 
 def loop(function: Loop) -> Loop:
-    """`function` compiled, or as it is where there is no numba."""
+    """Compile `function`, or return it unchanged without numba."""
     if numba is None:
         return function
     options: dict[str, Any] = {"nogil": True, "fastmath": FINITE_MATH, "error_model": "numpy"}
@@ -84,7 +84,7 @@ def logarithm(s: np.float32) -> np.float32:
 def row_sums(
     mu: Float32, S: Float32, partners: Float32, covariances: Float32, log_weights: Float32, floor: Float32
 ) -> Float32:
-    """(16, n) sums of `plain.row_sums`: mu (3, n), S (6, n), (3, k, n), (6, k, n), (k, n), (n,)."""
+    """(16, n) sums of `plain.row_sums`, from mu (3, n), S (6, n) and planes (3, k, n), (6, k, n), (k, n), (n,)."""
     n = log_weights.shape[1]
     out = np.empty((16, n), np.float32)
     w, total = np.empty(20 * ROWS, np.float32), np.empty(16 * ROWS, np.float32)

@@ -16,10 +16,10 @@ from garps_core.objective.loops import Float32, Int64, loop
 NEAREST_M = 1e-3
 """Points nearer than this, or behind the camera, have no place in its image, m."""
 PER_CELL = 2.0
-"""Partners in a cell, on average."""
+"""Average number of partners in a cell."""
 MOST_ROWS = 40_000
-"""With more rows the tree is faster: a row without a partner nearby looks through all the cells around it, and they
-are the more, the denser the partners."""
+"""Largest number of rows for which cells are faster than the tree. A row without a partner nearby looks through all the
+cells around it, and denser partners mean more cells."""
 
 
 @loop
@@ -112,7 +112,7 @@ def _keep_nearest(
 
 @loop
 def _beyond(gap: float, line: float, z: float) -> float:
-    """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when nothing is known."""
+    """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when there is no bound."""
     if gap <= 0 or z <= NEAREST_M:
         return 0.0
     return float(gap * z / np.sqrt(1 + line * line))

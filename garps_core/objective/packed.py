@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Symmetric 3x3 matrices as six numbers, and how a pose turns them."""
+"""Symmetric 3x3 matrices as six numbers, and their rotation by a pose."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which components may be partners: thinning, two-way visibility, nearest neighbours, colour and label weights."""
+"""Choice of candidate pairs: thinning, two-way visibility, nearest neighbours, colour and label weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from garps_core.types import Frustum, Mixture
 
 @dataclass(frozen=True)
 class DeviceMixture:
-    """A mixture on the device: means (n, 3), covariances (n, 6), weights (n,), colours (n, 3), labels (n,) or None."""
+    """A mixture on the device, with the backend of its arithmetic.
+
+    means (n, 3), covariances (n, 6) (`packed.py`), weights (n,), colours (n, 3), labels (n,) or None.
+    """
 
     means: Tensor
     covariances: Tensor
@@ -59,7 +62,7 @@ def to_device(mixture: Mixture, config: Config) -> DeviceMixture:
 
 
 def thin(cloud: DeviceMixture, components: int) -> DeviceMixture:
-    """An even subsample of at most `components` by index; lifted mixtures are listed along a space-filling curve."""
+    """Take an even subsample of at most `components` by index; lifted mixtures lie along a space-filling curve."""
     if len(cloud) <= components:
         return cloud
     index = torch.arange(components, device=cloud.means.device, dtype=torch.float64) * (len(cloud) / components)
@@ -105,7 +108,7 @@ def pair_up(rows: DeviceMixture, partners: DeviceMixture, T: Array, rung: Rung, 
 
 
 def widened(covariances: Tensor, rung: Rung) -> Tensor:
-    """Packed covariances (n, 6) as a rung sees them: scaled, and blurred in all directions by half of `blur_m`'s."""
+    """Scale packed covariances (n, 6) by a rung, and add half the variance of its `blur_m` in all directions."""
     wider = covariances * rung.covariance_scale
     if rung.blur_m > 0:
         wider[:, [0, 3, 5]] += 0.5 * rung.blur_m**2
@@ -115,7 +118,7 @@ def widened(covariances: Tensor, rung: Rung) -> Tensor:
 def _gathered(
     rows: DeviceMixture, partners: DeviceMixture, index: Tensor, rung: Rung, settings: Alignment
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of each row's partners, index (n, k): means (3, k, n), covariances (6, k, n), log weights (k, n).
+    """Means (3, k, n), covariances (6, k, n) and log weights (k, n) of the partners with index (n, k).
 
     Colours cost half their squared Mahalanobis distance, each with `colour_variance` per channel.
     """
@@ -133,7 +136,7 @@ def _nearest(rows: DeviceMixture, partners: DeviceMixture, T: Array, k: int) -> 
 
 
 def _log_floor(covariances: Tensor, partners: DeviceMixture, floor: float) -> Tensor:
-    """log o_i: `floor` times what one partner of mean weight gives a row of the same covariance at distance zero."""
+    """log o_i (n,): `floor` times the density of one partner of mean weight and equal covariance at distance zero."""
     a, b, c, e, f, i = (2 * covariances).double().unbind(-1)
     det = a * (e * i - f * f) - b * (b * i - c * f) + c * (b * f - c * e)
     scale = torch.log(partners.weights.double().mean() * max(floor, 1e-30))

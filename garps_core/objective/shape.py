@@ -7,7 +7,7 @@ For rows i (components of one mixture, moved by T = (R, t)) and their partners j
     s_i  = sum_j g_ij
 
 two objectives are offered. "sum" is the paper's: log sum_i phi_i s_i (its eq. 5; the logarithm keeps the optimum).
-"log" is sum_i phi_i log(1 + s_i / o_i): o_i is the density of an outlier, so that one row has a bounded say.
+"log" is sum_i phi_i log(1 + s_i / o_i): o_i is the density of an outlier, so that the influence of one row is bounded.
 
 With u = S^-1 d, over a left twist (v, w) of T (derived in docs/objective.md):
 
@@ -76,7 +76,7 @@ class Evaluation:
     gradient: Array
     information: Array
     observed: Array
-    """Information less what the uncertain assignment of partners takes away; may be indefinite far from an optimum."""
+    """Observed information (6, 6), in which partners may change; it may be indefinite far from an optimum."""
     support: float
     """Weighted share of rows whose partners outweigh the outlier density ("log"), else 1."""
 

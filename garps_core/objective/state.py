@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the solver moves, and what it knows beforehand: pose and depth errors."""
+"""The unknowns of the solver, pose and depth errors, and their prior."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from garps_core.geometry import Array, se3_exp
 
 @dataclass(frozen=True)
 class State:
-    """Where the solver stands: pose T (4x4), errors (12,) of the source's, then the target's depth map, or (0,)."""
+    """Unknowns: pose T (4x4), and errors (12,) of the source's, then the target's depth map, or (0,) for none."""
 
     T: Array
     errors: Array = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, step: Array) -> State:
-        """After a step (6 + errors,): a left twist, and what is added to the errors."""
+        """The state after a step (6 + errors,): a left twist, then increments of the errors."""
         return State(se3_exp(np.asarray(step[:6], np.float64)) @ self.T, self.errors + step[6:])
 
 
 @dataclass(frozen=True)
 class WeightedStart:
-    """What is known beforehand: the pose T, its precision (6, 6) over the left twist, and that of the errors (e,)."""
+    """Starting pose T with its precision (6, 6) over the left twist, and the precision (e,) of the depth errors."""
 
     T: Array
     precision: Array

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose and depth errors in one solution: what both depth maps get wrong as a whole is estimated, not averaged.
+"""The objective over the pose and the smooth errors of both depth maps together.
 
 Two maps that differ by a few per cent in scale and shape cannot be superposed rigidly; a rigid fit turns the
 difference into motion. So each map may have a smooth relative error, six polynomials of the ray's slopes
@@ -8,8 +8,8 @@ and of the target's map: 6 or 18 numbers.
 
     d = R p (1 + phi(p) a_s) + t - y (1 + psi(y) a_t)
 
-A partner's error is taken at its row's place, psi(mu') for psi(y): the field is smooth and they are neighbours. Then a
-row is simply somewhere else, the pair loop is that of the pose alone, and J gains the columns (R p) phi and -mu' psi.
+A partner's error is taken at the place of its row, psi(mu') for psi(y): the field is smooth and they are neighbours.
+Then only the rows move, the pair loop is that of the pose alone, and J gains the columns (R p) phi and -mu' psi.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from garps_core.objective.shape import Evaluation, Pairs, derivatives, evaluate
 from garps_core.objective.state import State
 
 MODES = DEPTH_MODES
+"""Number of error modes of one depth map."""
 
 
 def corrected(cloud: DeviceMixture, errors: Array) -> DeviceMixture:
-    """The cloud with its means moved along their rays by the given errors (6,) of its depth map, or () for none."""
+    """Move the means along their rays by the errors (6,) of their depth map; () = none."""
     if not len(errors):
         return cloud
     means = cloud.means.double()

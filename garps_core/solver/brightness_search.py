@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from garps_core.geometry import Array
 from garps_core.mixture import Frustum
-from garps_core.objective.brightness import Grid, both_ways, climb_on, grid_of
+from garps_core.objective.brightness import Grid, climb_on, comparisons, grid_of
 from garps_core.objective.state import WeightedStart
 
 WIDTH_PX = 40
@@ -49,7 +49,7 @@ def _first(ranked: tuple[float, Array]) -> float:
 
 def _agreement(x: Grid, y: Grid, T: Array) -> float:
     """Correlation of brightness times the share that both cameras see; 0 where too little is seen."""
-    seen = both_ways(x, y, T)
+    seen = comparisons(x, y, T)
     if seen is None:
         return 0.0
     return min(one.correlation for one in seen) * min(one.share for one in seen)

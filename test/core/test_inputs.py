@@ -107,7 +107,7 @@ PRIORS = {
     "covariance diagonal only": (lambda: Prior(np.eye(4), np.ones(6)), r"has shape \(6,\): expected 6x6"),
     "covariance zero": (
         lambda: Prior(np.eye(4), np.zeros((6, 6))),
-        "not positive definite: .* zeros do not mean unknown, give every direction a positive variance",
+        "not positive definite: .* zeros do not mean unknown; give every direction a positive variance",
     ),
     "covariance indefinite": (lambda: Prior(np.eye(4), INDEFINITE), "not positive definite: smallest eigenvalue -1"),
     "covariance asymmetric": (
@@ -140,7 +140,7 @@ MIXTURES = {
     ),
     "covariance indefinite": (
         lambda: mixture(covariances=changed(GOOD.covariances, 7, np.diag([1, 1, -1]))),
-        r"component 7 has eigenvalue -1 m\^2; expected positive definite, add a small variance",
+        r"component 7 has eigenvalue -1 m\^2; expected positive definite; add a small variance",
     ),
     "covariance asymmetric": (
         lambda: mixture(covariances=changed(GOOD.covariances, (7, 0, 1), 9)),

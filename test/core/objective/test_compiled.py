@@ -44,7 +44,7 @@ def clouds(kind, config=None):
 
 
 def assert_close(got, expected, name=""):
-    """Relative to the largest of the same plane, infinities alike."""
+    """Compare relative to the largest number; infinities must be in the same places."""
     got, expected = np.asarray(got, np.float64), np.asarray(expected, np.float64)
     np.testing.assert_array_equal(np.isinf(got), np.isinf(expected))
     there = np.isfinite(expected)
@@ -66,7 +66,7 @@ def functions_of(module):
 
 
 def test_both_backends_offer_the_functions_of_the_protocol():
-    """With the same signatures, but for `self`."""
+    """The signatures are equal but for `self`."""
     asked = {
         name: signature.replace(parameters=list(signature.parameters.values())[1:])
         for name, signature in (
@@ -93,7 +93,7 @@ def test_the_backend_is_chosen_once_and_carried_along(monkeypatch, dtype):
 
 
 @needs_numba
-def test_the_exponential_is_that_of_the_library():
+def test_the_exponential_agrees_with_numpy():
     x = np.linspace(-79.9, 79.9, 20_001, dtype=np.float32)
     got = np.array([loops.exponential(value) for value in x])
     np.testing.assert_allclose(got, np.exp(x.astype(np.float64)), rtol=5e-7)
@@ -101,7 +101,7 @@ def test_the_exponential_is_that_of_the_library():
 
 @needs_numba
 @pytest.mark.parametrize("kind", KINDS)
-def test_sums_over_partners_are_torch_s(kind):
+def test_sums_over_partners_agree_with_torch(kind):
     rows, partners, T = clouds(kind)
     pairs = plain_pairs(rows, partners, T, replace(SETTINGS, max_distance_m=0.3))
     assert torch.isinf(pairs.log_weights).any(), "partners that are none"
@@ -119,7 +119,7 @@ def test_sums_over_partners_are_torch_s(kind):
 @needs_numba
 @pytest.mark.parametrize("form", ["log", "sum"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_evaluations_are_torch_s(kind, form):
+def test_evaluations_agree_with_torch(kind, form):
     rows, partners, T = clouds(kind)
     pairs = plain_pairs(rows, partners, T)
     pairs = without_floor(pairs) if form == "sum" else pairs
@@ -133,8 +133,8 @@ def test_evaluations_are_torch_s(kind, form):
 
 @needs_numba
 @pytest.mark.parametrize("kind", KINDS)
-def test_moments_are_torch_s(kind):
-    """From the same sums, so that nothing but the summation differs."""
+def test_moments_agree_with_torch(kind):
+    """Both start from the same sums, so only the summation differs."""
     rows, partners, T = clouds(kind)
     pairs = plain_pairs(rows, partners, T)
     mu, S = moved_rows(pairs.means, pairs.covariances, T)
@@ -148,7 +148,7 @@ def test_moments_are_torch_s(kind):
 
 @needs_numba
 @pytest.mark.parametrize("kind", KINDS)
-def test_gathered_partners_are_torch_s(kind):
+def test_gathered_partners_agree_with_torch(kind):
     rows, partners, _ = clouds(kind)
     index = torch.from_numpy(np.random.default_rng(0).integers(0, len(partners), (len(rows), 7)))
     fast, slow = (
@@ -162,7 +162,7 @@ def test_gathered_partners_are_torch_s(kind):
 
 @needs_numba
 @pytest.mark.parametrize("ratio", [0.0, 0.1, 100.0])
-def test_visible_components_are_torch_s(ratio):
+def test_visible_components_agree_with_torch(ratio):
     """Points within rounding of a pixel's border or of the depth may differ."""
     (source, target), seen_shares = two_mixtures(), []
     holes = target.frustum.depth.copy()
@@ -203,7 +203,7 @@ def test_neighbours_are_those_of_the_tree(kind, where):
 
 
 @needs_numba
-def test_all_partners_are_neighbours_where_all_are_asked_for():
+def test_all_partners_are_neighbours_when_k_is_their_number():
     rows, partners = (part[:60].contiguous() for part in neighbours_of("scattered", "among them"))
     index, distance = neighbours.nearest(rows.numpy(), partners.numpy(), 60)
     np.testing.assert_array_equal(np.sort(index, axis=1), np.tile(np.arange(60), (60, 1)))
@@ -214,7 +214,7 @@ def test_all_partners_are_neighbours_where_all_are_asked_for():
 
 @needs_numba
 def test_partners_behind_their_camera_are_left_to_the_tree():
-    """Cells of an image cannot hold them; the answer is right all the same."""
+    """Cells of an image cannot hold them; the result is still exact."""
     rows, partners, T = clouds("scattered")
     behind = replace(partners, means=partners.means - torch.tensor([0, 0, 3.0]))
     _, distance = pairs._nearest(rows, behind, T, 5)
@@ -252,7 +252,7 @@ def test_threads_and_repetitions_give_the_same_bits(preset):
 
 
 def test_without_numba_everything_works():
-    """In a process that cannot import it, on the same views."""
+    """A process that cannot import numba aligns the same views."""
     program = """
 import sys
 sys.modules["numba"] = None

@@ -161,7 +161,7 @@ def test_information_is_the_curvature_of_the_surrogate_with_partners_held(form):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_observed_information_is_the_curvature_with_partners_free(form):
-    """Only the row covariances are frozen and the motion linear; of "sum" it is that of f, relative to f."""
+    """Only the row covariances are frozen, and the motion is linear. "sum" is compared through f, relative to f."""
     dense = Dense()
     means, S_row = dense.linear_motion()
     zero = torch.zeros(6, dtype=torch.float64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visibility: points are compared with the depth of the pixel they fall on; pairing and brightness conclude apart."""
+"""Visibility by the depth of the pixel that a point falls on, one-sided for pairing, two-sided for brightness."""
 
 from dataclasses import replace
 

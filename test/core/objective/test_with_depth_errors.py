@@ -148,7 +148,7 @@ def test_corrected_points_stay_on_their_rays():
 
 
 def test_correcting_the_clouds_is_evaluating_with_the_errors():
-    """Of the rows to the last digit: what the solver does between its rungs changes nothing."""
+    """For the rows it is exact, so the corrections between the rungs of the solver change nothing."""
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
     errors, rung, far = (
         drawn(6, 0.03)[:MODES],
@@ -165,7 +165,7 @@ def test_correcting_the_clouds_is_evaluating_with_the_errors():
 
 @lru_cache(maxsize=4)
 def wrong_in_scale(gains=(1.03, 0.99), shapes=(0.0, 0.0)):
-    """Both views with depth off by a factor each, 4 per cent between them, and bent by so much at the border."""
+    """Both views, each with its depth scaled by its gain and bent by its shape (relative, at the border)."""
     views = []
     for view, gain, shape in zip(two_views(camera=np.diag([2, 2, 1]) @ K, size=(240, 320)), gains, shapes, strict=True):
         across = np.linspace(-1, 1, view.depth.shape[1], dtype=np.float32)
