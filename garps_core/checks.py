@@ -63,7 +63,7 @@ def checked_covariance(name: str, covariance: Any) -> Float64Array:
     if C.shape != (6, 6):
         raise InputError(f"{name} has shape {C.shape}: expected 6x6 (x, y, z in m; rotations about X, Y, Z in rad)")
     if not np.isfinite(C).all():
-        raise InputError(f"{name} holds NaN or infinity: expected finite variances; use large ones for unknown")
+        raise InputError(f"{name} holds NaN or infinity: expected finite variances; use a large one for unknown")
     if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
         raise InputError(f"{name} is not symmetric: largest difference {np.abs(C - C.T).max():.3g}, expected 0")
     smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
