@@ -41,7 +41,7 @@ from garps_core.mixtures import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:
-    from bench.demo.live import LivePose  # needs rclpy
+    from bench.demo.live import LivePose
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""

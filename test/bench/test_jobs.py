@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from dask_cluster import ENVIRONMENT, running_cluster
 
-from bench.rows.jobs import computed
+from bench.machine.jobs import computed
 
 
 def slow_square(number: int, notes: Path) -> tuple[int, int]:

@@ -6,7 +6,8 @@ import torch
 import typer
 from torch import nn
 
-from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, counted_flop, measured
+from bench.machine.flop import counted_flop
+from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, measured
 from bench.networks.pair import STAGES, measured_pair
 from garps_core.models import depth_anything
 from garps_core.models.vit import Attention

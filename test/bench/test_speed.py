@@ -9,15 +9,16 @@ import torch
 import typer
 from surfaces import TRUTH, look, random_pose
 
-from bench.pairs.datasets import Pair, scene_points
+from bench.pairs.pair import Pair, scene_points
 from bench.peers.autograd import PlainObjective
+from bench.report.checks import Check, Section, markdown
 from bench.speed import __main__ as speed
 from bench.speed import fresh
 from bench.speed.determinism import determinism_section
 from bench.speed.growth import growth_section, slopes, subset
 from bench.speed.memory import memory_section
 from bench.speed.pairs import CHAIN, GARPS, pairs_section
-from bench.speed.parts import Check, Inputs, Section, interleaved, markdown, threads
+from bench.speed.parts import Inputs, interleaved, threads
 from bench.speed.solver import autograd_section, contest, paper_section, plain, start_of
 from bench.speed.stream import _loop, _planes, _torch_stream, exact_pairs, reference, stream_section
 from garps_core import Config, Prior

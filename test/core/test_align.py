@@ -259,10 +259,10 @@ def test_cuda_that_is_not_there_is_named():
 
 def lounge_pairs():
     """Three pairs of a recorded RGB-D camera; skipped where the recordings are not."""
-    datasets = pytest.importorskip("bench.pairs.datasets")
-    if "hololens_lounge" not in datasets.available(DATA):
+    pairs_json = pytest.importorskip("bench.pairs.readers.pairs_json")
+    if "hololens_lounge" not in pairs_json.available(DATA):
         pytest.skip(f"no recorded pairs in {DATA}/dev/hololens_lounge")
-    return datasets.load_pairs("hololens_lounge", DATA, limit=3)
+    return pairs_json.load_pairs("hololens_lounge", DATA, limit=3)
 
 
 def test_recorded_pairs_from_features():
@@ -275,9 +275,9 @@ def test_recorded_pairs_from_features():
 
 
 def test_recorded_pairs_from_a_disturbed_truth():
-    datasets = pytest.importorskip("bench.pairs.datasets")
+    starts = pytest.importorskip("bench.pairs.starts")
     for pair in lounge_pairs():
-        prior = datasets.disturbed_prior(pair)
+        prior = starts.disturbed_prior(pair)
         start = translation_error_m(prior.T_target_source, pair.T_target_source)
         estimate = estimate_relative_pose(pair.source, pair.target, prior=prior)
         assert estimate.T_target_source is not None, f"{pair.id}: {estimate.reason}"
