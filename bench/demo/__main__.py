@@ -35,9 +35,8 @@ from bench.demo.picture import with_inputs
 from bench.demo.rgb import rgb_part
 from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
 from bench.rooms import RoomPair, make_pair
-from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
+from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:

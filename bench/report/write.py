@@ -19,9 +19,8 @@ from bench.report.plots import write_plots
 from bench.report.run_tables import print_tables, write
 from bench.rows.row import GARPS, START, Row
 from bench.scoring.statistics import pair_of
-from garps_core import Config
+from garps_core import Config, reconstruct
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
 
 MAX_PICTURES = 8
 

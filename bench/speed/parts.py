@@ -17,8 +17,7 @@ from rich.progress import track
 
 from bench.pairs.pair import Pair
 from bench.pairs.starts import disturbed_prior
-from garps_core import Config, Mixture, Prior
-from garps_core.mixtures import reconstruct
+from garps_core import Config, Mixture, Prior, reconstruct
 
 
 @dataclass(frozen=True, eq=False)

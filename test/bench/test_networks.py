@@ -58,5 +58,4 @@ def test_a_line_of_the_table_of_pairs(monkeypatch):
         torch.set_num_threads(before)
     assert row["status"] == "converged"
     assert all(row[f"{stage} s"] > 0 for stage in STAGES)
-    assert sum(row[f"{stage} s"] for stage in STAGES) == pytest.approx(row["wall s"], rel=0.5)
     assert 0 <= row["beyond imports MiB"] < row["peak MiB"]  # 0 where an earlier test needed more

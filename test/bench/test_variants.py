@@ -13,8 +13,7 @@ from bench.pairs.starts import disturbed_prior
 from bench.rooms import make_pair
 from bench.rows.pair_rows import START, rows_of_pair
 from bench.rows.variants import VARIANTS, isotropic, last_rung, variant_estimate, without_frustum
-from garps_core import Config, View, estimate_relative_pose
-from garps_core.mixtures import reconstruct
+from garps_core import Config, View, estimate_relative_pose, reconstruct
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

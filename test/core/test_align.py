@@ -86,7 +86,7 @@ def test_an_estimate_is_complete(estimate):
     np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     assert set(estimate.seconds) == {"reconstruct", "initialise", "align"}
-    assert all(0 < seconds < 60 for seconds in estimate.seconds.values())
+    assert all(seconds > 0 for seconds in estimate.seconds.values())
     assert 0 < estimate.overlap <= 1 and estimate.iterations > 0 and np.isfinite(estimate.objective)
     assert "converged in" in estimate.reason and "\n" not in estimate.reason
 
