@@ -25,9 +25,11 @@ import typer
 from rich.console import Console
 
 from bench.pairs import learned_rooms
-from bench.pairs.datasets import DATA, Pair, available, disturbed_prior, load_pairs, spread
-from bench.pairs.sources import DEMO_NET, config_of, with_depth_of
-from bench.scoring.depth_errors import depth_errors
+from bench.pairs.depths import DEMO_NET, config_of, with_depth_of
+from bench.pairs.pair import Pair, spread
+from bench.pairs.readers.pairs_json import DATA, available, load_pairs
+from bench.pairs.starts import disturbed_prior
+from bench.rows.depth_errors import depth_errors
 from garps_core import Config, estimate_relative_pose, metrics
 from garps_core.models.demo_net import DemoNet, depth_of, shipped
 from garps_core.types import View

@@ -20,10 +20,10 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.networks.__main__ import counted_flop
-from bench.networks.pair import peak_mib, seconds_of
-from bench.scoring.tables import machine_facts
-from bench.speed.parts import Check, Row, Section, markdown
+from bench.machine.cost import peak_mib, seconds_of
+from bench.machine.facts import machine_facts
+from bench.machine.flop import counted_flop
+from bench.report.checks import Check, Row, Section, markdown
 from garps_core.models.mast3r import NaverModel, prepared
 from garps_core.models.two_view import Architecture, Stack, TwoView
 

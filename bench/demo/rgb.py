@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 
 from bench.demo.picture import with_inputs
-from bench.pairs.datasets import scene_points
+from bench.pairs.pair import scene_points
 from bench.rooms import RoomPair, make_pair
-from bench.scoring.depth_errors import depth_errors
+from bench.rows.depth_errors import depth_errors
 from garps_core import View, metrics
 from garps_core.checks import Float64Array
 from garps_core.cli.command import main as garps
