@@ -18,8 +18,9 @@ from bench.speed.parts import Inputs, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import to_device
-from garps_core.objective.shape import Pairs, evaluate, unpack
+from garps_core.objective.shape import Pairs, evaluate
 from garps_core.objective.state import State
 from garps_core.solver import ladder, paper
 
