@@ -15,7 +15,14 @@ from garps_core.config import Alignment, Config
 from garps_core.config.combinations import check_settings
 from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
-from garps_core.errors import InitialisationError, InputError, ModelError, ReconstructionError, WeightsError
+from garps_core.errors import (
+    InitialisationError,
+    InputError,
+    MissingDepthError,
+    ModelError,
+    ReconstructionError,
+    WeightsError,
+)
 from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.mixtures.reconstruct import mixtures_of, with_depth
 from garps_core.models.depth_networks import depth_from
@@ -54,7 +61,7 @@ def estimate_relative_pose(
     Returns:
         PoseEstimate; when no pose could be had its status and reason say why and T_target_source is None.
     Raises:
-        ReconstructionError: a view holds too little depth, by itself; of a two-view network's depth the status says so.
+        MissingDepthError: a view has no depth, and the settings want a sensor's.
         ConfigError: the device is not there, or settings do not go together.
         WeightsError: a network's weights are missing or not what they should be.
     """
@@ -104,8 +111,7 @@ def _estimated(
         config = _doubting(config, *views)
         x, y = mixtures_of(views, config, NETWORKS)
     except (ModelError, ReconstructionError) as failure:
-        of_pair = config.reconstruction.method == "two_view"
-        if isinstance(failure, WeightsError) or (isinstance(failure, ReconstructionError) and not of_pair):
+        if isinstance(failure, (WeightsError, MissingDepthError)):
             raise  # a mistake of whoever set this up, not of these images
         return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
     spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()

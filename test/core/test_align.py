@@ -13,7 +13,7 @@ from surfaces import FREE, TRUTH, disturbed, grey_at, look, off, room, two_mixtu
 import garps_core
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status, View, align_mixtures, estimate_relative_pose
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.start.initialise import initialise
 
 PUBLIC = {
@@ -32,7 +32,7 @@ PUBLIC = {
     "View": ["rgb", "K", "depth", "stamp_ns", "frame_id", "K_estimated"],
     "align_mixtures": ["source", "target", "initial", "config"],
     "estimate_relative_pose": ["source", "target", "config", "prior"],
-    "reconstruct": ["view", "config"],
+    "reconstruct": ["view", "config", "networks"],
 }  # fmt: skip
 MEANT_SENSOR = {"lifting.noise_floor_m": 1e-3, "lifting.noise_linear": 0.0, "lifting.noise_quadratic_per_m": 2e-3}
 
