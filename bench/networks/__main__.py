@@ -57,12 +57,12 @@ class Case:
 
 def depth_anything(case: Case) -> tuple[Call, str]:
     """Depth Anything V2, and the size its images get."""
-    from garps_core.models.depth_anything import DepthAnythingV2, built_from, depth_of, network_size
+    from garps_core.models.depth_anything import DepthAnythingV2, built_from, depth_of_images, network_size
 
     model = built_from(DepthAnythingV2(case.size, 20.0).state_dict(), max_depth=20.0)
     pictures = case.pictures()
     rows, columns = network_size(pictures[0])
-    return lambda: depth_of(model, pictures), f"{rows}x{columns}"
+    return lambda: depth_of_images(model, pictures), f"{rows}x{columns}"
 
 
 def flash3d(case: Case) -> tuple[Call, str]:
@@ -80,11 +80,11 @@ def flash3d(case: Case) -> tuple[Call, str]:
 
 def labels_by_dinov2(case: Case) -> tuple[Call, str]:
     """DINOv2 with the linear ADE20K head; one image at a time, each as large as it is."""
-    from garps_core.models.semantics import Segmenter, prepared, segment
+    from garps_core.models.semantics import Segmenter, padded_input, segment
 
     network = Segmenter(case.size, last_blocks=1, classes=150).eval().requires_grad_(False)
     pictures = case.pictures()
-    rows, columns = prepared(pictures[0]).shape[-2:]
+    rows, columns = padded_input(pictures[0]).shape[-2:]
     return lambda: [segment(network, picture) for picture in pictures], f"{rows}x{columns}"
 
 

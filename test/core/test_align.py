@@ -32,7 +32,7 @@ PUBLIC = {
     "View": ["rgb", "K", "depth", "stamp_ns", "frame_id", "K_estimated"],
     "align_mixtures": ["source", "target", "initial", "config"],
     "estimate_relative_pose": ["source", "target", "config", "prior"],
-    "reconstruct": ["view", "config"],
+    "reconstruct": ["view", "config", "networks"],
 }  # fmt: skip
 MEANT_SENSOR = {"lifting.noise_floor_m": 1e-3, "lifting.noise_linear": 0.0, "lifting.noise_quadratic_per_m": 2e-3}
 
