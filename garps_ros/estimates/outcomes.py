@@ -78,7 +78,7 @@ class ViewReader:
     """Frame -> View; says which calibration is used, once and whenever that changes.
 
     Args:
-        rectified: "auto", "true" or "false".
+        rectified: "auto", "rectified" or "raw".
         say: called with a line for people.
         allow_resized: accept images that were scaled evenly against their CameraInfo.
     """
