@@ -16,7 +16,7 @@ from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information
 from garps_core.objective.state import State

@@ -8,7 +8,7 @@ import pytest
 from surfaces import off, room
 
 from garps_core import Config, align
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.solver import search
 from garps_core.solver.brightness_search import PURSUED, search_by_brightness
 from garps_core.start.initialise import identity

@@ -10,7 +10,7 @@ from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixture
 
 from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
 from garps_core.geometry import se3_inverse, se3_log
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import to_device
 from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, search
