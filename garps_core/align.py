@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from garps_core.objective.pairs import DeviceMixture, overlap, to_device
 from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
+from garps_core.solver.problem import Problem
 from garps_core.solver.search import search
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
@@ -185,10 +187,11 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
     maximise = paper.maximise if settings.solver == "adam" else search if guess else ladder.anneal
     findings = []
-    for solution in maximise(x, y, known, settings):
-        findings.append(_finding(solution, x, y, known, guess, config))
-        if findings[-1].convincing(settings):
-            break
+    with ThreadPoolExecutor(1) as pool:
+        for solution in maximise(Problem(x, y, known, config, pool, guess)):
+            findings.append(_finding(solution, x, y, known, guess, config))
+            if findings[-1].convincing(settings):
+                break
     if not findings:
         shared = overlap(x, y, known.T, settings)
         return _too_little(shared, initial, settings)
