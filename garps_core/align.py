@@ -27,8 +27,9 @@ from garps_core.solver.problem import Problem
 from garps_core.solver.search import search
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
+from garps_core.verdict.candidate import Candidate, best_candidate
 from garps_core.verdict.covariance import inflated, pose_covariance, share_of_known
-from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
+from garps_core.verdict.status import quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0
 """What a search found may be a neighbour of the right optimum: its sigmas count so many times as much."""
@@ -186,16 +187,12 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
     maximise = paper.maximise if settings.solver == "adam" else search if guess else ladder.anneal
-    findings = []
     with ThreadPoolExecutor(1) as pool:
-        for solution in maximise(Problem(x, y, known, config, pool, guess)):
-            findings.append(_finding(solution, x, y, known, guess, config))
-            if findings[-1].convincing(settings):
-                break
-    if not findings:
+        solutions = maximise(Problem(x, y, known, config, pool, guess))
+        best = best_candidate((_candidate(end, x, y, known, guess, config) for end in solutions), settings)
+    if best is None:
         shared = overlap(x, y, known.T, settings)
         return _too_little(shared, initial, settings)
-    best = max(findings, key=lambda finding: finding.merit)
     if best.overlap < settings.min_overlap:
         return _too_little(best.overlap, initial, settings)
     uncertainty = relative_uncertainty(source, best.T, best.covariance)
@@ -210,7 +207,7 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
         best.solution.iterations,
         best.solution.data.value,
         quality(best, guess),
-        float("nan") if best.seen is None else best.merit,
+        float("nan") if best.brightness is None else best.merit,
     )
 
 
@@ -236,10 +233,10 @@ def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
     return np.asarray(covariance + sigma**2 * np.outer(along, along))
 
 
-def _finding(
+def _candidate(
     solution: Solution, x: DeviceMixture, y: DeviceMixture, known: WeightedStart, guess: bool, config: Config
-) -> Finding:
-    """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
+) -> Candidate:
+    """A solution with its covariance, refined by brightness where the mixtures come with any."""
     settings, T = config.alignment, solution.T
     covariance, kept, seen = pose_covariance(solution, known, config.lifting), np.eye(6), None
     if x.frustum is not None and y.frustum is not None:
@@ -257,4 +254,4 @@ def _finding(
         common = config.start.network_scale_sigma
     if common > 0:
         covariance = _of_one_scale(covariance, T, common)
-    return Finding(solution, T, covariance, overlap(x, y, T, settings), seen)
+    return Candidate(solution, T, covariance, overlap(x, y, T, settings), seen)

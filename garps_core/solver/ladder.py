@@ -65,11 +65,18 @@ class Solution:
     """The data term at T, for the covariance and the verdict."""
     pairs: tuple[Pairs, Pairs] | None = None
     """Pairs on which `data` was evaluated: source rows to target partners, and target rows to source partners."""
+    fixed_steps: bool = False
+    """The paper's sum was maximised for a fixed number of steps: there is no test of convergence, and no support."""
 
     @property
     def T(self) -> Array:
         """4x4 pose."""
         return self.at.T
+
+    @property
+    def support(self) -> float | None:
+        """Share of the components with a partner; None where the objective has none."""
+        return None if self.fixed_steps else self.data.support
 
 
 def two_way(forward: Pairs, backward: Pairs, at: State, pool: Executor) -> Evaluation:
@@ -149,10 +156,8 @@ def ascend(function: Callable[[State], Posterior], at: State, steps: int, tolera
     here = function(at)
     floor = 1e-12 * np.eye(len(here.gradient))
     damping, used = FIRST_DAMPING, 0
-    while used < steps:
+    while not (converged := _squared_step(here, floor) < tolerance**2) and used < steps:
         H = here.information
-        if float(here.gradient @ np.linalg.solve(H + floor, here.gradient)) < tolerance**2:
-            return Ascent(at, here, used, True)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + floor, here.gradient)
         candidate = at.moved(np.asarray(step, np.float64))
         there = function(candidate)
@@ -161,7 +166,12 @@ def ascend(function: Callable[[State], Posterior], at: State, steps: int, tolera
             at, here, damping = candidate, there, max(damping * DECAY, SMALLEST_DAMPING)
         else:
             damping = max(damping, FIRST_DAMPING) * GROWTH
-    return Ascent(at, here, used, False)
+    return Ascent(at, here, used, converged)
+
+
+def _squared_step(here: Posterior, floor: Array) -> float:
+    """Squared length of the undamped Newton step in the metric of the curvature, in sigmas squared."""
+    return float(here.gradient @ np.linalg.solve(here.information + floor, here.gradient))
 
 
 def rung_pairs(problem: Problem, T: Array, rung: Rung, density: float) -> tuple[Pairs, Pairs] | None:

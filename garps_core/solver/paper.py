@@ -86,4 +86,4 @@ def maximise(problem: Problem) -> list[Solution]:
     at = State(adam_path(pairs, start.T, settings, rung.steps)[-1])
     weight = settings.effective_measurements * rung.covariance_scale
     end = posterior(evaluate(pairs, at.T, "sum"), at, WeightedStart(start.T, start.precision), weight)
-    return [Solution(at, end, rung.steps, True, weight, end.data)]
+    return [Solution(at, end, rung.steps, True, weight, end.data, fixed_steps=True)]
