@@ -12,7 +12,7 @@ from rich.table import Table
 
 @dataclass
 class Summary:
-    """What happened to the messages and pairs of a replay."""
+    """Counts of the messages and pairs of a replay."""
 
     pairs: int = 0
     used: int = 0
@@ -26,10 +26,10 @@ class Summary:
     segments: int = 0
     broken_end: str = ""
     seconds: list[float] = field(default_factory=list)
-    """Wall time per pair, from messages to pose."""
+    """Wall time of each pair from messages to pose, s."""
 
     def count(self, status: str, published: bool, seconds: float | None) -> None:
-        """Count a pair by its status; `seconds` is its wall time, None where it never reached the estimator."""
+        """Count a pair by its status; `seconds` is its wall time, None if the core never got it."""
         self.pairs += 1
         if published:
             self.used += 1
@@ -44,7 +44,7 @@ class Summary:
         self.first_refused = self.first_refused or reason
 
     def table(self) -> Table:
-        """The summary for people."""
+        """Return the summary as a table for people."""
         table = Table(show_header=False, title="Replay")
         table.add_row("pairs in", str(self.pairs))
         table.add_row("poses used", str(self.used))

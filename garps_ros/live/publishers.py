@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the live node publishes: pose, odometry, clouds, diagnostics. Only the executor's thread comes here."""
+"""The publishers of the live node: pose, odometry, transform, clouds, diagnostics; for the executor's thread only."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sensor_msgs.msg import PointCloud2
 
 from garps_core.checks import Float64Array
 from garps_ros.estimates.outcomes import Outcome
-from garps_ros.live.estimator import ColouredPoints
-from garps_ros.live.health import Finding
+from garps_ros.live.clouds import ColouredPoints
+from garps_ros.live.diagnostics import Check
 from garps_ros.live.inputs import SIDES
 from garps_ros.live.log import Log
 from garps_ros.live.transforms import Transforms
@@ -31,18 +31,18 @@ CLOUD_QOS = QoSProfile(depth=1)
 
 @functools.cache
 def message_class(name: str) -> Any:
-    """The rclpy class of a full message name, e.g. "geometry_msgs/msg/Pose"."""
+    """Return the rclpy class of a full message name, e.g. "geometry_msgs/msg/Pose"."""
     package, _, kind = name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), kind)
 
 
-class Publishing:
+class Publishers:
     """The node's publishers.
 
     Args:
         node: to publish with.
         transforms: also publish on /tf.
-        log: takes what cannot be published.
+        log: told about clouds and transforms that are not published.
     """
 
     def __init__(self, node: Node, transforms: bool, log: Log) -> None:
@@ -53,9 +53,12 @@ class Publishing:
         self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QOS)
         self._poses, self._points = PoseWriter(message_class), CloudWriter(message_class)
         self._transforms: Transforms | None = None
+        self.transform = "off"
+        """State of the transform, in words: "off", "waiting", "published", or why it was not published."""
         if transforms:
             try:
                 self._transforms = Transforms(node, self._poses, partial(log.warn, "tf"))
+                self.transform = "waiting"
             except ImportError as error:
                 log.warn("tf", f"publish_tf has no effect: {error}; install tf2_msgs (apt: ros-jazzy-tf2-msgs)")
 
@@ -70,11 +73,9 @@ class Publishing:
         """True while somebody subscribes to a cloud."""
         return any(publisher.get_subscription_count() for publisher in self._clouds)
 
-    def publish(self, outcome: Outcome, T: Float64Array, covariance: Float64Array) -> str:
+    def publish(self, outcome: Outcome, T: Float64Array, covariance: Float64Array) -> None:
         """Publish a pose (4x4, m) with its covariance (6x6, ROS meaning), stamped with the source image's time.
 
-        Returns:
-            What became of the transform, for the diagnostics.
         Raises:
             MessageError: a pose or covariance that must not be published; nothing is published then.
         """
@@ -82,12 +83,11 @@ class Publishing:
         odometry = self._poses.odometry(T, covariance, stamp_ns, frame_id, outcome.child_frame_id)
         self._pose.publish(self._poses.pose_stamped(T, stamp_ns, frame_id))
         self._odometry.publish(odometry)
-        if self._transforms is None:
-            return "off"
-        return self._transforms.send(T, stamp_ns, frame_id, outcome.child_frame_id) or "published"
+        if self._transforms is not None:
+            self.transform = self._transforms.send(T, stamp_ns, frame_id, outcome.child_frame_id) or "published"
 
-    def show(self, clouds: tuple[ColouredPoints, ColouredPoints], outcome: Outcome) -> None:
-        """Publish the source and target clouds to those that are subscribed to."""
+    def publish_clouds(self, clouds: tuple[ColouredPoints, ColouredPoints], outcome: Outcome) -> None:
+        """Publish the source and the target cloud, each if somebody subscribes to it."""
         stamp_ns = outcome.row.source_stamp_ns
         for publisher, cloud in zip(self._clouds, clouds, strict=True):
             if not publisher.get_subscription_count():
@@ -99,21 +99,21 @@ class Publishing:
                 continue
             publisher.publish(message)
 
-    def report(self, findings: Iterable[Finding]) -> None:
-        """Publish findings on /diagnostics, each named after the node."""
+    def publish_checks(self, checks: Iterable[Check]) -> None:
+        """Publish checks on /diagnostics, each named after the node."""
         name = self._node.get_fully_qualified_name().lstrip("/")
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = [_status(f"{name}: {finding.name}", name, finding) for finding in findings]
+        message.status = [_status(f"{name}: {check.name}", name, check) for check in checks]
         self._diagnostics.publish(message)
 
 
-def _status(full_name: str, hardware: str, finding: Finding) -> DiagnosticStatus:
-    values = [KeyValue(key=str(key), value=str(value)) for key, value in finding.values.items()]
+def _status(full_name: str, hardware: str, check: Check) -> DiagnosticStatus:
+    values = [KeyValue(key=str(key), value=str(value)) for key, value in check.values.items()]
     return DiagnosticStatus(
-        level=bytes([int(finding.level)]),
+        level=bytes([int(check.level)]),
         name=full_name,
-        message=str(finding.message),
+        message=str(check.message),
         hardware_id=hardware,
         values=values,
     )

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every verdict of the diagnostics: its level, what it names, and the counts that come with it."""
+"""Every check of the diagnostics: its level, its message and its lines."""
 
 import mmap
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from recordings import SECOND, START
 
-from garps_ros.live.arrivals import Arrivals
-from garps_ros.live.health import WINDOW, Health, InputState, Level, memory
+from garps_ros.estimates.outcomes import Origin, Outcome, Row
+from garps_ros.live.arrivals import Arrivals, InputState
+from garps_ros.live.counts import WINDOW, Counts
+from garps_ros.live.diagnostics import Diagnostics, Level, NodeState, memory
+from garps_ros.live.jobs import Result
+from garps_ros.parameters.settings import NodeSettings
 
-NOW, TIMEOUT, SLOP = 1000.0, 5.0, 0.02
+NOW = 1000.0
+STATE = NodeState(NodeSettings(input_timeout=5.0, sync_slop=0.02, stage_timeout=10.0), NOW)
 IMAGE = InputState("source/image", "/right/image_rect", Arrivals(), 1, "RELIABLE")
 INFO = InputState("source/camera_info", "/right/camera_info", Arrivals(), 1, "RELIABLE", once=True)
 PRIOR = InputState("prior", "/pose_node/prior", Arrivals(), 0, "BEST_EFFORT", once=True, optional=True)
@@ -31,16 +35,24 @@ def arrivals(age_s=0.0, count=30, rate=15.0, kept=1.0):
 FINE = replace(IMAGE, arrivals=arrivals())
 
 
-def inputs(*states, health=None, waiting="", now_s=NOW):
-    return (health or Health()).inputs(states, now_s, TIMEOUT, waiting)
+class Node(Diagnostics):
+    """The diagnostics of a node with its counts."""
+
+    def __init__(self, counts=None):
+        self.counts = counts or Counts()
+        super().__init__(self.counts)
 
 
-def estimates(health, idle="", gaps_s=None, now_s=NOW, busy_s=0.0):
-    return health.estimates(idle, busy_s, gaps_s or {}, SLOP, now_s, TIMEOUT)
+def inputs(*states, node=None, waiting="", now_s=NOW):
+    return (node or Node()).inputs(replace(STATE, inputs=states, clock_warning=waiting, now_s=now_s))
 
 
-def machine(health, stage="", busy_s=0.0, **values):
-    return health.machine(stage, busy_s, 10.0, values)
+def estimates(node, **state):
+    return node.estimates(replace(STATE, **state))
+
+
+def machine(node, stage="", busy_s=0.0, **state):
+    return node.machine(replace(STATE, stage=stage, busy_s=busy_s, **state))
 
 
 def test_levels_are_those_of_the_message():
@@ -53,25 +65,25 @@ def test_levels_are_those_of_the_message():
 
 
 def test_inputs_that_arrive_are_fine():
-    finding = inputs(FINE, replace(INFO, arrivals=arrivals()), replace(PRIOR, arrivals=arrivals()))
-    assert (finding.name, finding.level, finding.message) == ("inputs", Level.OK, "all inputs arrive")
+    check = inputs(FINE, replace(INFO, arrivals=arrivals()), replace(PRIOR, arrivals=arrivals()))
+    assert (check.name, check.level, check.message) == ("inputs", Level.OK, "all inputs arrive")
 
 
 @pytest.mark.parametrize("publishers", [0, 2])
 @pytest.mark.parametrize("state", [IMAGE, INFO])
 def test_a_missing_input_is_named_with_its_topic_and_publishers(state, publishers):
-    finding = inputs(FINE, replace(state, publishers=publishers))
-    assert finding.level == Level.ERROR and "nothing received" in finding.message
+    check = inputs(FINE, replace(state, publishers=publishers))
+    assert check.level == Level.ERROR and "nothing received" in check.message
     for word in (state.role, state.topic, f"{publishers} publisher"):
-        assert word in finding.message
+        assert word in check.message
 
 
 def test_all_that_is_missing_is_named():
-    finding = inputs(IMAGE, INFO, replace(FINE, role="source/depth", arrivals=arrivals(age_s=7.0)))
-    assert finding.level == Level.ERROR
+    check = inputs(IMAGE, INFO, replace(FINE, role="source/depth", arrivals=arrivals(age_s=7.0)))
+    assert check.level == Level.ERROR
     for word in ("source/image", "source/camera_info", "source/depth", "silent", "7.0 s"):
-        assert word in finding.message
-    assert "prior" not in finding.message
+        assert word in check.message
+    assert "prior" not in check.message
 
 
 @pytest.mark.parametrize(("age_s", "level"), [(4.9, Level.OK), (5.1, Level.ERROR)])
@@ -96,11 +108,11 @@ def test_a_prior_may_be_absent_and_may_cease():
 
 
 @pytest.mark.parametrize("state", [IMAGE, FINE, PRIOR])
-def test_a_known_problem_of_type_or_qos_is_said_instead_of_the_silence(state):
-    finding = inputs(replace(state, problem="incompatible QoS: driver offers BEST_EFFORT"))
-    assert finding.level == Level.ERROR and "nothing received" not in finding.message
-    assert state.role in finding.message and state.topic in finding.message
-    assert finding.message.endswith("incompatible QoS: driver offers BEST_EFFORT")
+def test_a_known_reason_of_type_or_qos_is_said_instead_of_the_silence(state):
+    check = inputs(replace(state, warning="incompatible QoS: driver offers BEST_EFFORT"))
+    assert check.level == Level.ERROR and "nothing received" not in check.message
+    assert state.role in check.message and state.topic in check.message
+    assert check.message.endswith("incompatible QoS: driver offers BEST_EFFORT")
 
 
 def test_a_clock_that_has_not_come_is_an_error_beside_the_others():
@@ -111,34 +123,34 @@ def test_a_clock_that_has_not_come_is_an_error_beside_the_others():
 
 
 def test_what_was_refused_is_said_for_a_second_and_counted_for_ever():
-    health = Health()
-    health.refuse("/a", "header.stamp is zero")
-    health.refuse("/b", "no camera_info yet")
-    health.refuse("/a", "header.stamp is null")
-    first, second = inputs(FINE, health=health), inputs(FINE, health=health)
+    node = Node()
+    node.counts.refuse("/a", "header.stamp is zero")
+    node.counts.refuse("/b", "no camera_info yet")
+    node.counts.refuse("/a", "header.stamp is null")
+    first, second = inputs(FINE, node=node), inputs(FINE, node=node)
     assert first.level == Level.WARN
     assert first.message == "3 message(s) refused in the last second: /a: header.stamp is null"
     assert (second.level, second.message) == (Level.OK, "all inputs arrive")
-    health.refuse("/b", "no camera_info yet")
-    third = inputs(FINE, health=health)
+    node.counts.refuse("/b", "no camera_info yet")
+    third = inputs(FINE, node=node)
     assert third.level == Level.WARN and third.message.startswith("1 message(s) refused")
     counts = {"messages refused": "4", "refused: /a": "2", "refused: /b": "2", "last refused": "/b: no camera_info yet"}
     assert third.values.items() >= counts.items()
 
 
 def test_a_missing_input_goes_before_refused_messages_which_are_not_said_later():
-    health = Health()
-    health.refuse("/a", "header.stamp is zero")
-    assert inputs(IMAGE, health=health).level == Level.ERROR
-    assert inputs(FINE, health=health).level == Level.OK
+    node = Node()
+    node.counts.refuse("/a", "header.stamp is zero")
+    assert inputs(IMAGE, node=node).level == Level.ERROR
+    assert inputs(FINE, node=node).level == Level.OK
 
 
 def test_loss_on_the_way_is_a_warning_that_says_what_helps():
     lossy = replace(IMAGE, arrivals=arrivals(count=200, kept=0.4))
-    finding = inputs(FINE, lossy)
-    assert finding.level == Level.WARN
+    check = inputs(FINE, lossy)
+    assert check.level == Level.WARN
     for word in ("source/image: about ", "%", "/right/image_rect", "fastdds_large_images.xml", "compressed"):
-        assert word in finding.message
+        assert word in check.message
     assert inputs(replace(lossy, once=True)).level == Level.OK, "a calibration may come as it likes"
     assert inputs(replace(IMAGE, arrivals=arrivals(count=200, kept=0.95))).level == Level.OK
 
@@ -158,122 +170,139 @@ def test_the_values_of_an_input_are_complete():
 
 
 def test_poses_are_counted_by_the_second():
-    health = Health()
-    assert estimates(health).message == "waiting for images"
+    node = Node()
+    assert estimates(node).message == "waiting for images"
     for _ in range(3):
-        health.publish(0.3, 0.1, 0.15)
-    first, second = estimates(health), estimates(health)
+        node.counts.publish(0.3, 0.1, 0.15)
+    first, second = estimates(node), estimates(node)
     assert (first.name, first.level, first.message) == ("estimates", Level.OK, "3 pose(s) in the last second")
     assert second.message == "waiting for images" and second.values["poses used"] == "3"
 
 
 def test_a_rejection_is_a_warning_with_its_reason_for_a_second():
-    health = Health()
-    health.publish(0.3, 0.1, 0.15)
-    health.reject("low_overlap", "3 % of the components")
-    health.reject("degenerate", "one direction is open")
-    first, second = estimates(health), estimates(health)
+    node = Node()
+    node.counts.publish(0.3, 0.1, 0.15)
+    node.counts.reject("low_overlap", "3 % of the components")
+    node.counts.reject("degenerate", "one direction is open")
+    first, second = estimates(node), estimates(node)
     assert first.level == Level.WARN
     assert first.message == "2 rejected in the last second: degenerate: one direction is open"
     assert second.level == Level.OK
     assert second.values["rejected: low_overlap"] == second.values["rejected: degenerate"] == "1"
     assert second.values["last rejected"] == "degenerate: one direction is open"
     assert second.values["last status"] == "degenerate"
-    health.publish(0.3, 0.1, 0.15)
-    assert estimates(health).values["last status"] == "converged"
+    node.counts.publish(0.3, 0.1, 0.15)
+    assert estimates(node).values["last status"] == "converged"
 
 
 def test_doing_nothing_on_purpose_is_fine_whatever_else():
-    health = Health()
-    inputs(FINE, health=health, now_s=1.0)
-    health.reject("low_overlap", "early")
-    finding = estimates(health, idle="nobody subscribes (lazy)")
-    assert (finding.level, finding.message) == (Level.OK, "nobody subscribes (lazy)")
-    assert estimates(health, now_s=1.0).level == Level.OK, "the rejection was of an earlier second"
+    node = Node()
+    inputs(FINE, node=node, now_s=1.0)
+    node.counts.reject("low_overlap", "early")
+    check = estimates(node, idle="nobody subscribes (lazy)")
+    assert (check.level, check.message) == (Level.OK, "nobody subscribes (lazy)")
+    assert estimates(node, now_s=1.0).level == Level.OK, "the rejection was of an earlier second"
 
 
-def watched(health, seconds, state=FINE, last_pair_s=None):
-    """The finding on estimates after some seconds of watching the inputs."""
-    health.last_pair_s = last_pair_s
+def watched(node, seconds, state=FINE, last_pair_s=None):
+    """The check on estimates after some seconds of watching the inputs."""
+    node.counts.last_pair_s = last_pair_s
     for second in range(seconds + 1):
         steady = replace(state, arrivals=arrivals(NOW - (NOW + second))) if state is FINE else state
-        inputs(steady, health=health, now_s=NOW + second)
-    return estimates(health, gaps_s={"/a and /b": -0.25, "/c and /d": 0.0}, now_s=NOW + seconds)
+        inputs(steady, node=node, now_s=NOW + second)
+    return estimates(node, gaps_s={"/a and /b": -0.25, "/c and /d": 0.0}, now_s=NOW + seconds)
 
 
 def test_inputs_that_never_pair_are_a_warning_with_gaps_and_slop():
-    finding = watched(Health(), 6)
-    assert finding.level == Level.WARN
+    check = watched(Node(), 6)
+    assert check.level == Level.WARN
     for word in ("none belong together", "sync_slop = 0.02 s", "/a and /b are -0.250 s apart", "/c and /d are +0.000"):
-        assert word in finding.message
-    assert watched(Health(), 5).level == Level.OK, "not yet for longer than the timeout"
+        assert word in check.message
+    assert watched(Node(), 5).level == Level.OK, "not yet for longer than the timeout"
 
 
 def test_inputs_that_pair_no_longer_are_a_warning_too():
-    assert watched(Health(), 6, last_pair_s=NOW - 100).level == Level.WARN
-    assert watched(Health(), 6, last_pair_s=NOW + 0.9).level == Level.WARN
-    assert watched(Health(), 6, last_pair_s=NOW + 1.1).level == Level.OK
+    assert watched(Node(), 6, last_pair_s=NOW - 100).level == Level.WARN
+    assert watched(Node(), 6, last_pair_s=NOW + 0.9).level == Level.WARN
+    assert watched(Node(), 6, last_pair_s=NOW + 1.1).level == Level.OK
 
 
 def test_without_inputs_it_is_not_said_that_they_do_not_pair():
-    finding = watched(Health(), 60, IMAGE)
-    assert (finding.level, finding.message) == (Level.OK, "waiting for images")
+    check = watched(Node(), 60, IMAGE)
+    assert (check.level, check.message) == (Level.OK, "waiting for images")
 
 
 def test_inputs_that_come_back_get_their_time_to_pair():
-    health = Health()
-    inputs(FINE, health=health, now_s=NOW)
-    inputs(IMAGE, health=health, now_s=NOW + 60)
-    inputs(replace(FINE, arrivals=arrivals(-61)), health=health, now_s=NOW + 61)
-    assert estimates(health, now_s=NOW + 62).level == Level.OK
-    assert estimates(health, now_s=NOW + 67).level == Level.WARN
+    node = Node()
+    inputs(FINE, node=node, now_s=NOW)
+    inputs(IMAGE, node=node, now_s=NOW + 60)
+    inputs(replace(FINE, arrivals=arrivals(-61)), node=node, now_s=NOW + 61)
+    assert estimates(node, now_s=NOW + 62).level == Level.OK
+    assert estimates(node, now_s=NOW + 67).level == Level.WARN
 
 
 def test_every_pair_is_accounted_for():
-    health = Health(pairs_in=10)
-    health.dropped["a newer pair came"] += 4
-    health.facts["overlap"] = "0.81"
-    values = estimates(health).values
+    node = Node(Counts(pairs_in=10))
+    node.counts.dropped["a newer pair came"] += 4
+    values = estimates(node).values
     assert values["pairs in"] == "10" and values["poses used"] == "0"
-    assert values["dropped: a newer pair came"] == "4" and values["overlap"] == "0.81"
+    assert values["dropped: a newer pair came"] == "4" and values["transform"] == "off"
     assert not any("(ms)" in key for key in values), "no latency before the first pose"
 
 
+def result(status="converged", overlap=0.81, **fields):
+    row = Row(1, 2, "left", "right", status, "", overlap, quality=0.7)
+    return Result(None, [Outcome(row, "right", "left", None, None, None)], **fields)
+
+
+def test_the_lines_of_the_last_result_stay_until_the_node_begins_anew():
+    node = Node()
+    node.note(result(prior="used", warnings=["one", "two"], keyframes=3))
+    node.note(result(overlap=None, warnings=["three"]))
+    expected = {"frames": "left in right", "overlap": "0.81", "quality": "0.70", "keyframes": "3"}
+    assert estimates(node).values.items() >= {**expected, "prior": "none", "warnings": "three"}.items()
+    node.note(Result(None, [Origin(1, "left_start", "left", 5)]))
+    assert estimates(node).values["frames"] == "left in left_start"
+    node.forget()
+    assert not {*expected, "prior", "warnings"} & set(estimates(node).values)
+
+
 def test_latency_is_told_apart():
-    health = Health()
+    node = Node()
     for index in range(1, 101):
-        health.publish(latency_s=0.010 * index, waiting_s=0.002 * index, core_s=0.005 * index)
-    values = estimates(health).values
+        node.counts.publish(latency_s=0.010 * index, waiting_s=0.002 * index, core_s=0.005 * index)
+    values = estimates(node).values
     expected = {"latency p50": 505, "latency p95": 950.5, "core p50": 252.5, "waiting p50": 101, "overhead p50": 151.5}
     assert {key: float(values[f"{key} (ms)"]) for key in expected} == pytest.approx(expected, abs=0.06)
     for _ in range(WINDOW):
-        health.publish(0.020, 0.0, 0.015)
-    assert estimates(health).values["latency p95 (ms)"] == "20.0", "what is long ago no longer counts"
+        node.counts.publish(0.020, 0.0, 0.015)
+    assert estimates(node).values["latency p95 (ms)"] == "20.0", "what is long ago no longer counts"
 
 
 # --- machine ----------------------------------------------------------------------------------------------------------
 
 
 def test_the_worker_at_work_and_at_rest():
-    assert (machine(Health()).level, machine(Health()).message) == (Level.OK, "idle")
-    busy = machine(Health(), "estimate", 9.9, device="cpu")
+    assert (machine(Node()).level, machine(Node()).message) == (Level.OK, "idle")
+    busy = machine(Node(), "estimate", 9.9, unpaired=2, scale="the depth topics, m")
     assert (busy.name, busy.level, busy.message) == ("machine", Level.OK, "computing: estimate")
-    assert busy.values == {"stage": "estimate", "busy (s)": "9.90", "last error": "", "device": "cpu"}
+    expected = {"stage": "estimate", "busy (s)": "9.90", "last error": "", "device": "cpu", "enabled": "True"}
+    assert busy.values.items() >= {**expected, "unpaired messages": "2", "scale from": "the depth topics, m"}.items()
 
 
 def test_a_stuck_computation_is_an_error_that_names_its_stage():
-    finding = machine(Health(), "estimate", 12.34)
-    assert finding.level == Level.ERROR
+    check = machine(Node(), "estimate", 12.34)
+    assert check.level == Level.ERROR
     for word in ("stuck: estimate", "12.3 s", "at most 10 s", "stage_timeout"):
-        assert word in finding.message
+        assert word in check.message
 
 
 def test_a_death_of_the_worker_is_an_error_for_a_second_and_counted_for_ever():
-    health = Health()
-    health.fail("worker", "ended by MemoryError: ; restarted")
-    health.fail("callback", "ValueError: x")
-    health.fail("worker", "ended by SystemExit: 3; restarted")
-    first, second = machine(health, "estimate", 99.0), machine(health)
+    node = Node()
+    node.counts.fail("worker", "ended by MemoryError: ; restarted")
+    node.counts.fail("callback", "ValueError: x")
+    node.counts.fail("worker", "ended by SystemExit: 3; restarted")
+    first, second = machine(node, "estimate", 99.0), machine(node)
     assert (first.level, first.message) == (Level.ERROR, "worker: ended by SystemExit: 3; restarted")
     assert (second.level, second.message) == (Level.OK, "idle")
     expected = {"errors: worker": "2", "errors: callback": "1", "last error": first.message}
@@ -289,16 +318,7 @@ def test_memory_is_that_of_this_process():
     assert after["device"] == "cpu" and len(after) == 2
 
 
-def test_a_verdict_takes_no_time():
-    health, states = Health(), [FINE] * 7
-    began = time.perf_counter()
-    for _ in range(20):
-        inputs(*states, health=health)
-        estimates(health)
-    assert time.perf_counter() - began < 2
-
-
 def test_a_long_computation_is_not_waiting_for_images():
-    health = Health()
-    assert estimates(health).message == "waiting for images"
-    assert estimates(health, busy_s=2.5).message == "computing for 2.5 s"
+    node = Node()
+    assert estimates(node).message == "waiting for images"
+    assert estimates(node, busy_s=2.5).message == "computing for 2.5 s"

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the worker of the live node computes: messages that belong together -> outcomes, in the offline replay's way."""
+"""The computation of the live node: a job holds messages that belong together, its result the outcomes.
+
+It takes the same steps as the offline replay (`estimates.outcomes`), so that both give the same poses.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from garps_core.align import estimate_with_mixtures
-from garps_core.checks import Float64Array
+from garps_core.align import Estimator
 from garps_core.config import Config
 from garps_core.geometry import se3_inverse
+from garps_core.models.in_use import Networks
 from garps_core.types import Mixture, PoseEstimate, Prior, View
-from garps_ros.cameras import Frame
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
 from garps_ros.estimates.outcomes import (
     Origin,
@@ -38,17 +37,19 @@ from garps_ros.estimates.preparation import (
     settings_of_completed,
     warm_up,
 )
+from garps_ros.frames.frame import Frame
+from garps_ros.live.clouds import ColouredPoints, coloured_points
 from garps_ros.live.priors import prior_from_message
 from garps_ros.parameters.settings import NodeSettings
 from msg_adapters import MessageError, header_frame_id
 
-IN_CORE = ("depth", "estimate")
-"""Stages whose time is the core's."""
+CORE_STAGES = ("depth", "estimate")
+"""Stages that count as time of the core."""
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One pair of frames, or one frame to follow, and all that its computation depends on.
+    """One pair of frames, or one frame to follow, and everything that its computation depends on.
 
     Args:
         frames: (source, target), or (source,) to be followed against its keyframe.
@@ -70,37 +71,41 @@ class Job:
     clouds: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class ColouredPoints:
-    """Points (Nx3 float32, m) with colours (Nx3 uint8)."""
-
-    points: npt.NDArray[np.float32]
-    colours: npt.NDArray[np.uint8]
-
-
 @dataclass(eq=False)
 class Result:
-    """What came of a job."""
+    """The outcomes of a job, and what is to be reported with them."""
 
     job: Job
     outcomes: list[Origin | Outcome] = field(default_factory=list)
     began_s: float = 0.0
-    """Steady time at which the computation began."""
+    """Steady time at which the computation began, s."""
     core_s: float = 0.0
-    """Time inside the estimator, all attempts together, and a network's for depth, s."""
+    """Time inside the core, all attempts and a network's depth together, s."""
     prior: str = "none"
-    """What became of the prior: none, used, or why not."""
-    doubts: list[str] = field(default_factory=list)
-    """What looks wrong about frame names; poses are computed all the same."""
+    """"none", "used", or the reason why the prior was not used."""
+    warnings: list[str] = field(default_factory=list)
+    """Frame names that look wrong; poses are computed all the same."""
     clouds: tuple[ColouredPoints, ColouredPoints] | None = None
-    """Source and target, both in the target frame, when asked for and when there is a pose."""
+    """Source and target, both in the target frame; None without a pose, or when the job did not ask."""
     trace: str = ""
-    """Of an error that nobody expected."""
+    """Traceback of an unexpected error."""
     keyframes: int = 0
-    """Keyframes so far, of the camera that is followed."""
+    """Keyframes so far of the camera that is followed."""
+
+    @property
+    def attempt(self) -> Outcome | None:
+        """The first attempt with a pose, else the last attempt; None where a trajectory begins."""
+        attempts = [outcome for outcome in self.outcomes if isinstance(outcome, Outcome)]
+        return next((attempt for attempt in attempts if attempt.T is not None), attempts[-1] if attempts else None)
 
 
-class Solver:
+def decisive_settings(settings: NodeSettings, config: Config) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Return the settings that a result depends on: those that decide how images are read, and the others."""
+    reading = settings.rectified, settings.allow_resized, config.reconstruction
+    return reading, (settings.source_frame, settings.target_frame, config)
+
+
+class JobRunner:
     """Computes jobs one after the other; keeps the keyframe between them.
 
     Args:
@@ -108,7 +113,7 @@ class Solver:
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+        self._say, self._networks = say, Networks()
         self._reader = ViewReader("auto", say)
         self._tracker: KeyframeTracker | None = None
         self._epoch = -1
@@ -117,20 +122,20 @@ class Solver:
         self._prior: Prior | None = None
         self._aligned: tuple[PoseEstimate, tuple[Mixture, Mixture] | None] | None = None
         self.stage = ""
-        """What the thread does at present; "" between jobs."""
+        """The present stage of the work; "" between jobs."""
         self.scale = ""
-        """Where metres come from, for people; known once prepared."""
+        """The source of metric scale, in words; "" until prepared."""
 
     def prepare(self, config: Config) -> None:
-        """Do what the first job would wait for. Raises what `load_networks` does."""
+        """Load networks and compile, so that the first job need not wait. Raises what `load_networks` does."""
         with self._in_stage("load networks"):
-            load_networks(config, self._say)
+            load_networks(config, self._say, self._networks)
             self.scale = scale_from(config)
         with self._in_stage("compile"):
             warm_up(config, self._say)
 
     def __call__(self, job: Job) -> Result:
-        """Compute a job. An error that nobody expected becomes an outcome with status core_error, and its trace."""
+        """Compute a job. An unexpected error becomes an outcome with status core_error and a traceback."""
         self._job, self._result, self._aligned, self._prior = job, Result(job, began_s=time.monotonic()), None, None
         self._reader.rectified, self._reader.allow_resized = job.settings.rectified, job.settings.allow_resized
         result = self._result
@@ -138,7 +143,7 @@ class Solver:
             try:
                 for outcome in self._outcomes():
                     result.outcomes.append(self._renamed(outcome))
-                result.doubts = self._doubts()
+                result.warnings = self._warnings()
                 if job.clouds and result.outcomes:
                     result.clouds = self._clouds(result.outcomes[-1])
             except Exception as error:
@@ -180,33 +185,33 @@ class Solver:
         except MessageError as error:
             self._result.prior = f"refused: {error}"
 
-    def _doubts(self) -> list[str]:
+    def _warnings(self) -> list[str]:
         frames, settings = self._job.frames, self._job.settings
-        doubts = [f"{f.topics.image}: {d}" for f in frames if (d := self._reader.doubts.get(f.topics.image))]
+        warnings = [f"{f.topics.image}: {w}" for f in frames if (w := self._reader.warnings.get(f.topics.image))]
         told = [header_frame_id(frame.image) for frame in frames]
         named = settings.source_frame and (settings.target_frame or len(frames) == 1)
         if not named and (not all(told) or len(set(told)) < len(told)):
             what = f"images say frame_id {', '.join(map(repr, told))}: topics name the frames instead"
-            doubts.append(f"{what}; set source_frame and target_frame")
-        return doubts
+            warnings.append(f"{what}; set source_frame and target_frame")
+        return warnings
 
     def _completed(self, view: View) -> View:
         with self._in_stage("depth"):
-            return completed(view, self._job.config)
+            return completed(view, self._job.config, self._networks)
 
     def _estimate(self, source: View, target: View) -> PoseEstimate:
         config = self._job.config
         if len(self._job.frames) == 1:
             config = settings_of_completed(config)
         with self._in_stage("estimate"):
-            found, mixtures = estimate_with_mixtures(source, target, config, self._prior)
+            found, mixtures = Estimator(config, self._networks).estimate_with_mixtures(source, target, self._prior)
         if self._prior is not None:
             self._result.prior = self._use_of_prior(found)
         self._aligned = found, mixtures if self._job.clouds else None
         return found
 
     def _use_of_prior(self, found: PoseEstimate) -> str:
-        """What became of the given prior: used, alone or with what was measured, or why not."""
+        """Return "used", alone or together with a measured start, or the reason why the prior was not used."""
         method = self._job.config.start.method
         if found.initial is None:
             return f"not used: {found.status.value}"
@@ -218,7 +223,7 @@ class Solver:
         return f"not used: {found.initial.origin} {verb} it"
 
     def _renamed(self, outcome: Origin | Outcome) -> Origin | Outcome:
-        """With the frame names that the settings ask for."""
+        """Replace the frame names where the settings give others."""
         settings = self._job.settings
         segment = outcome.segment if isinstance(outcome, Origin) else outcome.row.segment
         target = settings.target_frame and settings.target_frame + (f"_{segment}" if segment > 1 else "")
@@ -229,7 +234,7 @@ class Solver:
         )
 
     def _clouds(self, outcome: Origin | Outcome) -> tuple[ColouredPoints, ColouredPoints] | None:
-        """Both clouds in the frame of the outcome; with a keyframe that is not the keyframe's own."""
+        """Return both clouds in the frame of the outcome, which is not always the keyframe's own."""
         if isinstance(outcome, Origin) or outcome.T is None or self._aligned is None:
             return None
         found, mixtures = self._aligned
@@ -237,7 +242,7 @@ class Solver:
             return None
         with self._in_stage("clouds"):
             T_frame_target = outcome.T @ se3_inverse(found.T_target_source)
-            return _coloured_points(mixtures[0], outcome.T), _coloured_points(mixtures[1], T_frame_target)
+            return coloured_points(mixtures[0], outcome.T), coloured_points(mixtures[1], T_frame_target)
 
     @contextmanager
     def _in_stage(self, name: str) -> Iterator[None]:
@@ -246,10 +251,5 @@ class Solver:
             yield
         finally:
             self.stage = before
-            if name in IN_CORE:
+            if name in CORE_STAGES:
                 self._result.core_s += time.perf_counter() - began
-
-
-def _coloured_points(mixture: Mixture, T: Float64Array) -> ColouredPoints:
-    points = mixture.means @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
-    return ColouredPoints(points, np.clip(np.rint(255 * mixture.colours), 0, 255).astype(np.uint8))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MCAP files that were cut off: the whole records at their beginning, presented as a file with a proper end.
+"""MCAP files that were cut off: their whole records, presented as a file with a proper end.
 
 A recorder that loses power leaves a file without index and footer, and a folder without metadata.yaml. The format is
 made to be read anyway: records follow one another, each with its length (https://mcap.dev/spec).
@@ -16,11 +16,11 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
 FOOTER, DATA_END = 0x02, 0x0F
 END = RECORD_HEAD.pack(FOOTER, 20) + bytes(20) + MAGIC
-"""A footer that says: no index, read from the start."""
+"""A footer without index, for which readers start at the first record."""
 
 
 def salvageable(path: Path) -> Any:
-    """What can be opened instead of a recording that cannot: a path, a `CutMcap`, or None."""
+    """Return a path or a `CutMcap` to open instead of a recording that cannot be opened, or None."""
     files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
     if len(files) != 1 or files[0].suffix != ".mcap":
         return None
@@ -31,7 +31,7 @@ def salvageable(path: Path) -> Any:
 
 
 def _end_of_whole_records(path: Path) -> int | None:
-    """Where the last whole data record ends, bytes; None when the file is not cut off or is no MCAP file."""
+    """Return where the last whole data record ends, bytes; None when the file is not cut off or is no MCAP file."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -70,11 +70,11 @@ class CutMcap:
         return str(self._path)
 
     def exists(self) -> bool:
-        """Always."""
+        """Return True: the file was there when it was opened."""
         return True
 
     def is_dir(self) -> bool:
-        """Never."""
+        """Return False: it is a file."""
         return False
 
     def open(self, mode: str = "rb") -> BinaryIO:
