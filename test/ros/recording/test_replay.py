@@ -339,7 +339,7 @@ sys.exit(replay.main(sys.argv[1:]))
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_replay_leaves_valid_results(tmp_path, number):
     bag, out = write(tmp_path, "mcap", frames(["/cam"], 60, "rosbags")), tmp_path / "out"
-    command = [sys.executable, "-c", SLOW, str(ROOT / "test"), str(bag), "--out", str(out)]
+    command = [sys.executable, "-c", SLOW, str(ROOT / "test" / "tools"), str(bag), "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
