@@ -17,13 +17,14 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from garps_core.align import estimate_relative_pose
-from garps_core.config import METHODS, PRESETS, Config, preset_for
+from garps_core.align import Estimator
+from garps_core.config import PRESETS, Config, methods
 from garps_core.config.text import changed_config, read_settings
 from garps_core.errors import GarpsError
-from garps_core.types import PoseEstimate, View
+from garps_core.models.depth_networks import preset_for
+from garps_core.models.in_use import Networks
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
-from garps_ros.estimates.outcomes import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
+from garps_ros.estimates.outcomes import Completed, Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.estimates.preparation import (
     check_method,
     completed,
@@ -104,7 +105,7 @@ With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong in
 
 Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
 Reconstruction = Annotated[
-    str | None, typer.Option(help=f"Whose depth, one of {', '.join(METHODS[:-1])}. [auto: the depth topics]")
+    str | None, typer.Option(help=f"Whose depth, one of {', '.join(methods()[:-1])}. [auto: the depth topics]")
 ]
 ToRos = Annotated[bool, typer.Option("--to-ros", help="Play the recording into a live ROS 2 graph instead.")]
 Rate = Annotated[float, typer.Option(help="With --to-ros: seconds of the recording per second.", min=0.001, max=1000)]
@@ -176,9 +177,13 @@ def replay(
     target = CameraTopics(target_image, target_info, target_depth)
     with Bag(bag) as recording:
         cameras = choose_cameras(recording, source, target, pairing, needs_depth(config))
-        load_networks(config, lambda text: print(text, file=sys.stderr))
+        networks = Networks()
+        load_networks(config, lambda text: print(text, file=sys.stderr), networks)
         with Outputs(out, overwrite) as outputs:
-            return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
+            estimator = Estimator(config if len(cameras) == 2 else settings_of_completed(config), networks)
+            with_depth = partial(completed, config=config, networks=networks)
+            slop_ns = round(slop * NANOSECONDS)
+            return _run(recording, cameras, outputs, estimator, with_depth, rule, slop_ns, rectified, limit)
 
 
 def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
@@ -220,7 +225,8 @@ def _run(
     bag: Bag,
     cameras: list[CameraTopics],
     outputs: Outputs,
-    config: Config,
+    estimator: Estimator,
+    with_depth: Completed,
     rule: KeyframeRule,
     slop_ns: int,
     rectified: str,
@@ -234,7 +240,7 @@ def _run(
         with Progress(console=console, transient=True) as progress:
             say = console.print
             _say_choice(cameras, say)
-            outcomes = _outcomes(frames, ViewReader(rectified, say), config, rule, len(cameras))
+            outcomes = _outcomes(frames, ViewReader(rectified, say), estimator, with_depth, rule, len(cameras))
             expected = min(bag.counts[cameras[0].image], limit or sys.maxsize)
             record(progress.track(outcomes, expected, description="frames"), outputs, summary, stopped, limit)
         summary.unpaired, summary.broken_end = frames.unpaired(), bag.broken_end
@@ -243,17 +249,16 @@ def _run(
 
 
 def _outcomes(
-    frames: Frames, reader: ViewReader, config: Config, rule: KeyframeRule, cameras: int
+    frames: Frames,
+    reader: ViewReader,
+    estimator: Estimator,
+    with_depth: Completed,
+    rule: KeyframeRule,
+    cameras: int,
 ) -> Iterator[Origin | Outcome]:
-    used = config if cameras == 2 else settings_of_completed(config)
-
-    def estimate(source: View, target: View) -> PoseEstimate:
-        return estimate_relative_pose(source, target, used)
-
     if cameras == 2:
-        return estimate_pairs(frames.pairs(), reader, estimate)
-    with_depth = partial(completed, config=config)
-    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule), with_depth)
+        return estimate_pairs(frames.pairs(), reader, estimator.estimate)
+    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimator.estimate, rule), with_depth)
 
 
 def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:

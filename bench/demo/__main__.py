@@ -37,7 +37,7 @@ from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
 from bench.rooms import RoomPair, make_pair
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ import torch
 from bench.rooms import RoomPair, make_pair
 from bench.speed.parts import Row
 from garps_core import Config, PoseEstimate, View, estimate_relative_pose
-from garps_core.models import in_use
+from garps_core.align import NETWORKS
 from garps_core.models.depth_anything import DepthAnythingV2
 from garps_core.models.flash3d import Flash3D
 from garps_core.weights.manifest import BY_NAME
@@ -68,7 +68,7 @@ def measured_pair(method: str, runs: int, threads: int) -> Row:
     found: list[PoseEstimate] = []
     with tempfile.TemporaryDirectory() as folder:
         install(Path(folder))
-        in_use.depth_network("", "any").register_forward_hook(answering((pair.depth0, pair.depth1)))
+        NETWORKS.depth_network(config).register_forward_hook(answering((pair.depth0, pair.depth1)))
 
         def call() -> None:
             found.append(estimate_relative_pose(*views_of(pair), config))

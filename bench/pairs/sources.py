@@ -16,14 +16,15 @@ from bench.pairs.datasets import DATA, HALVES, Pair, read_pairs, scene_points, s
 from bench.pairs.readers import READERS, load
 from bench.pairs.readers.pair_list import RAW
 from garps_core import Config, GarpsError
+from garps_core.align import NETWORKS
 from garps_core.mixtures.reconstruct import with_depth
-from garps_core.models.in_use import depth_network_of
+from garps_core.models.depth_networks import presets
 
 PAIRS, ROOMS, BARE = "pairs", "rooms", "bare"
 NAMES = (PAIRS, ROOMS, BARE, *READERS)
 """`pairs`: a folder with a pairs.json; `rooms`, `bare`: generated; the others: `bench.pairs.readers`."""
 SENSOR, MONOCULAR, DEMO_NET = "sensor", "monocular", "demo_net"
-DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", DEMO_NET: "demo_net", "depth_anything_v2": "monocular"}
+DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", **presets()}
 """Whose depth: the set's own, the same spoilt as a network would, or a network's; and the preset that goes with it."""
 NOTHING_GIVEN = ("none", "disturbed")
 BY_DEFAULT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -116,7 +117,7 @@ def with_depth_of(pair: Pair, depth: str, seed: int = 0) -> Pair:
     if depth == MONOCULAR:
         return with_monocular_depth(pair, seed)
     config = Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth})
-    source, target = with_depth([pair.source, pair.target], config)
+    source, target = with_depth([pair.source, pair.target], config, NETWORKS)
     pair = replace(pair, source=source, target=target)
     if len(pair.points) or pair.scale == RAW:  # metres and the set's own unit do not mix
         return pair
@@ -128,7 +129,7 @@ def why_not(depth: str) -> str:
     if depth in (SENSOR, MONOCULAR):
         return ""
     try:
-        depth_network_of(Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth}).reconstruction)
+        NETWORKS.depth_network(Config.preset(DEPTHS[depth]).replace({"reconstruction.method": depth}))
     except GarpsError as error:
         return str(error)
     return ""

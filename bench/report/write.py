@@ -20,7 +20,7 @@ from bench.scoring.statistics_blocks import pair_of
 from bench.scoring.tables import GARPS, START, Row, print_tables, write
 from garps_core import Config
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 
 MAX_PICTURES = 8
 

@@ -16,8 +16,9 @@ import numpy as np
 from bench.pairs.datasets import Pair
 from bench.scoring.tables import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
-from garps_core.align import best_of
+from garps_core.align import NETWORKS
 from garps_core.errors import GarpsError, InitialisationError
+from garps_core.mixture_alignment import best_alignment
 from garps_core.mixtures.reconstruct import mixtures_of, with_depth
 from garps_core.models.semantics import labelled
 from garps_core.start.initialise import initialise
@@ -100,14 +101,17 @@ def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) 
     if not variant.same_start:
         of_start = config
     try:
-        views = with_depth([pair.source, pair.target], config)
-        x, y = (variant.mixture(mixture) for mixture in mixtures_of(views, config))
+        maps = None
+        if config.reconstruction.method == "two_view":
+            maps = NETWORKS.pair_maps(pair.source.rgb, pair.target.rgb, config)
+        views = with_depth([pair.source, pair.target], config, NETWORKS, maps)
+        x, y = (variant.mixture(mixture) for mixture in mixtures_of(views, config, NETWORKS))
         if variant.labels and pair.labels is not None:
             x, y = (labelled(m, seen, v.K) for m, seen, v in zip((x, y), pair.labels, views, strict=True))
-        starts = initialise(views[0], views[1], of_start, prior)
+        starts = initialise(views[0], views[1], of_start, prior, NETWORKS, maps)
         if not variant.believes_start:
             starts = tuple(replace(start, covariance=VAGUE * start.covariance) for start in starts)
-        return best_of(x, y, starts, config)
+        return best_alignment(x, y, starts, config)
     except InitialisationError as error:
         return PoseEstimate(Status.NO_INITIAL_POSE, str(error), initial=prior)
     except GarpsError as error:  # an answer about this pair, not about the others

@@ -70,7 +70,7 @@ def measure(full: tuple[Mixture, Mixture], n: int, k: int, inputs: Inputs) -> Ro
     source, target = (subset(mixture, n) for mixture in full)
     config, T = all_used(inputs.config, n, k), inputs.prior.T_target_source
     x, y = (to_device(mixture, config) for mixture in (source, target))
-    rung = Rung(config.alignment.ladder[-1].covariance_scale, n, k)
+    rung = Rung(covariance_scale=config.alignment.ladder[-1].covariance_scale, components=n, neighbours=k)
     row: Row = {"components": n, "neighbours": k}
     with threads(1):
         row["pairing"], pairs = timed(lambda: pair_up(x, y, T, rung, config.alignment))

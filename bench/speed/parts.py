@@ -18,7 +18,7 @@ from rich.table import Table
 
 from bench.pairs.datasets import Pair, disturbed_prior
 from garps_core import Config, Mixture, Prior
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 
 Row = dict[str, Any]
 

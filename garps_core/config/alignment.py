@@ -6,26 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from garps_core.config.field import Checked, setting
+from garps_core.config.ladders import SEARCH, SENSOR, SENSOR_SEARCH, Rung
 from garps_core.errors import ConfigError
-
-
-@dataclass(frozen=True)
-class Rung(Checked):
-    """One step of the annealing ladder."""
-
-    covariance_scale: float = setting(1.0, "multiplies every component covariance", low=1e-3, high=1e4)
-    components: int = setting(4000, "components used per view", low=50, high=1_000_000)
-    neighbours: int = setting(10, "nearest neighbours per component", low=1, high=200)
-    steps: int = setting(5, "solver steps at most", low=1, high=100_000)
-    blur_m: float = setting(
-        0.0, "sigma of an isotropic blur of a pair of components, so that far surfaces pull", unit="m", low=0, high=100
-    )
-    outlier_floor: float = setting(
-        0.0, "in place of `alignment.outlier_floor` when above 0; a small one lets far partners pull", low=0, high=10
-    )
-    occlusion_ratio: float = setting(
-        0.0, "in place of `alignment.occlusion_ratio` when above 0; far off, nearly all seems hidden", low=0, high=1000
-    )
 
 
 @dataclass(frozen=True)
@@ -37,25 +19,12 @@ class Alignment(Checked):
         "second_order = annealed maximum a posteriori; adam = the paper's method",
         choices=("second_order", "adam"),
     )
-    ladder: tuple[Rung, ...] = (
-        Rung(1000.0, 800, 20, 8),
-        Rung(300.0, 1000, 20, 8),
-        Rung(100.0, 1500, 20, 8),
-        Rung(30.0, 2000, 15, 8),
-        Rung(10.0, 3000, 12, 8),
-        Rung(4.0, 4000, 12, 8),
-        Rung(2.0, 5000, 12, 20),
-    )
-    search: tuple[Rung, ...] = (Rung(1000.0, 400, 40, 8, 0.3, 1e-4, 100.0),)
-    search_ladder: tuple[Rung, ...] = (
-        Rung(1000.0, 500, 40, 10, 0.08, 1e-4, 100.0),
-        Rung(100.0, 1000, 20, 8, 0.0, 0.0, 100.0),
-        Rung(100.0, 1500, 20, 8),
-        Rung(30.0, 2000, 15, 8),
-        Rung(10.0, 3000, 12, 8),
-        Rung(4.0, 4000, 12, 8),
-        Rung(2.0, 5000, 12, 20),
-    )
+    ladder: tuple[Rung, ...] = SENSOR
+    """Rungs from the start pose."""
+    search: tuple[Rung, ...] = SEARCH
+    """Rungs that rank the starting poses of a search."""
+    search_ladder: tuple[Rung, ...] = SENSOR_SEARCH
+    """Rungs from the best poses of a search."""
     search_followed: int = setting(4, "how many starting_poses of a search are followed to the end", low=1, high=100)
     partner_density: float = setting(
         1.0, "partners kept for each kernel-sized patch of a mixture; at least the rung's components", low=0, high=100

@@ -10,8 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from garps_core.config.alignment import Alignment, Rung
+from garps_core.config.alignment import Alignment
 from garps_core.config.field import Checked, flattened, replaced, setting
+from garps_core.config.ladders import NETWORK, NETWORK_SEARCH, PAPER
 from garps_core.config.lifting import Lifting
 from garps_core.config.reconstruction import Reconstruction
 from garps_core.config.start import Start
@@ -72,13 +73,12 @@ def _monocular() -> Config:
 
     And off by as much from one thing to the next: matches may fit by chance what is allowed for that, so more must.
     """
-    ladder = (Rung(100.0, 1000, 20, 8), Rung(30.0, 1500, 20, 8), Rung(10.0, 2000, 15, 10), Rung(4.0, 3000, 15, 15))
     return Config(
         lifting=Lifting(noise_floor_m=6e-3, noise_linear=0.03, scale_sigma=0.03, warp_sigma=0.02, patch_sigma=0.03),
         start=Start(min_inliers=10),
         alignment=Alignment(
-            ladder=ladder,
-            search_ladder=Alignment().search_ladder[:2] + ladder[1:],
+            ladder=NETWORK,
+            search_ladder=NETWORK_SEARCH,
             depth_errors=True,
             brightness_measurements=0.04,
             effective_measurements=5.0,
@@ -92,7 +92,7 @@ def _paper() -> Config:
         lifting=Lifting(weighting="equal"),
         alignment=Alignment(
             solver="adam",
-            ladder=(Rung(90.0, 1_000_000, 30, 1000),),
+            ladder=PAPER,
             colour_variance=0.4,
             component_stride=32,
             opacity_threshold=0.5,
@@ -139,13 +139,6 @@ def _demo_net() -> Config:
             "alignment.occlusion_ratio": 0.5,
         }
     )
-
-
-def preset_for(method: str, with_depth: bool) -> str:
-    """Name of the preset that goes with `reconstruction.method`, for views that bring depth or do not."""
-    if method == "demo_net":
-        return "demo_net"
-    return "default" if with_depth else "monocular"
 
 
 PRESETS: dict[str, Callable[[], Config]] = {

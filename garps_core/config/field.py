@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field
 from typing import Any, ClassVar
 
 from garps_core.errors import ConfigError
+
+Choices = tuple[str, ...] | Callable[[], tuple[str, ...]]
+"""The words a text setting may take, or a function that returns them, for words that depend on what is installed."""
 
 
 def setting(
@@ -19,15 +22,29 @@ def setting(
     unit: str = "",
     low: float | None = None,
     high: float | None = None,
-    choices: tuple[str, ...] = (),
+    choices: Choices = (),
     live: bool = True,
 ) -> Any:
-    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated.
+    """Return a dataclass field with its meaning, unit and allowed values; help and parameters are generated from it.
 
-    `live` = it may be changed while a node runs.
+    Args:
+        default: value in the preset `default`; its type is the type of the setting.
+        doc: meaning, complete in itself, as `ros2 param describe` prints it.
+        unit: unit of a number, "" = none.
+        low: smallest value of a number.
+        high: largest value of a number.
+        choices: the words a text may take, or a function that returns them; a function is called whenever they are
+            needed, never at import.
+        live: the setting may be changed while a node runs.
     """
     described = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
     return field(default=default, metadata=described)
+
+
+def description(f: dataclasses.Field[Any]) -> dict[str, Any]:
+    """Return the arguments `setting` was called with for this field, `choices` as a tuple."""
+    choices = f.metadata.get("choices", ())
+    return {**f.metadata, "choices": choices() if callable(choices) else choices}
 
 
 _KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
@@ -47,9 +64,12 @@ class Checked:
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, limits = getattr(self, f.name), f.metadata
+            value = getattr(self, f.name)
+            if type(value) is type(f.default) and value == f.default:
+                continue  # choices that depend on what is installed are not looked up at import
+            limits = description(f)
             name = self._prefix + f.name
-            if limits.get("choices") and value not in limits["choices"]:
+            if limits["choices"] and value not in limits["choices"]:
                 raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
             if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
                 _check_number(name, value, f.default, limits)

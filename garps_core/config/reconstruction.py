@@ -3,14 +3,48 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import EntryPoint
 
+from garps_core import plugins
 from garps_core.config.field import Checked, setting
 
-METHODS = ("auto", "rgbd", "depth_anything_v2", "demo_net", "flash3d", "two_view", "ply")
-DEPTH_NETWORKS = ("depth_anything_v2", "demo_net")
-"""Of them those that give depth of one image, which is then lifted like a sensor's."""
+DEPTH_NETWORKS = {
+    "depth_anything_v2": "garps_core.models.depth_anything:NETWORK",
+    "demo_net": "garps_core.models.demo_net:NETWORK",
+}
+"""Depth networks of this package by name, each with its `DepthNetwork` as "module:object"."""
+DEPTH_PLUGINS = "garps_core.depth"
+"""Entry point group of the depth networks that other distributions add (docs/extending.md)."""
 SCENES = ("any", "indoor", "outdoor")
+_BEFORE, _AFTER = ("auto", "rgbd"), ("flash3d", "two_view", "ply")
+
+
+def methods() -> tuple[str, ...]:
+    """Return what `reconstruction.method` may be."""
+    return *_BEFORE, *depth_networks(), *_AFTER
+
+
+def depth_networks() -> tuple[str, ...]:
+    """Return the names of the networks that give depth of one image: those of this package, then the installed ones."""
+    return *DEPTH_NETWORKS, *installed_depth_networks()
+
+
+def installed_depth_networks() -> dict[str, EntryPoint]:
+    """Return the entry points of the depth networks that other distributions add, by name. Nothing is imported.
+
+    None can take a name that means something else already.
+    """
+    return _installed(tuple(sys.path))
+
+
+@lru_cache(maxsize=4)
+def _installed(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """`installed_depth_networks` for this `sys.path`; settings are made too often to look there every time."""
+    taken = {*_BEFORE, *DEPTH_NETWORKS, *_AFTER}
+    return {name: point for name, point in plugins.installed(DEPTH_PLUGINS).items() if name not in taken}
 
 
 @dataclass(frozen=True)
@@ -22,7 +56,7 @@ class Reconstruction(Checked):
         "rgbd = the sensor's depth; a network; demo_net = the one in the package, a demonstration; two_view = that of "
         "start.method, which then runs once for both; ply = mixtures from files; auto = depth_anything_v2 without a "
         "sensor",
-        choices=METHODS,
+        choices=methods,
         live=False,
     )
     depth_weights: str = setting(

@@ -23,7 +23,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.checks import Float32Array
+from garps_core.config import Reconstruction
+from garps_core.devices import on_device
 from garps_core.errors import InputError, ModelError
+from garps_core.models.depth_networks import DepthNetwork
 from garps_core.types import View
 from garps_core.weights.reader import read_tensors
 from garps_core.weights.state_dict import load_strictly
@@ -99,6 +102,11 @@ class DemoNet(nn.Module):
         return logarithm
 
 
+def load_network(weights: str, scene: str, device: str) -> DemoNet:
+    """The network in the package on the device; it has no other weights and knows no scene but its own."""
+    return on_device(shipped(), device)
+
+
 def shipped() -> DemoNet:
     """The network with the weights of this package, ready to be used. WeightsError where they are not there."""
     with as_file(files("garps_core.models").joinpath(FILE)) as path:
@@ -123,8 +131,8 @@ def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Fl
     return found, float(np.sqrt(fx * fy) / UNIT_FOCAL_PX)
 
 
-def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
-    """Depth of each view, HxW float32 m along z, all in one pass.
+def depth_of(network: DemoNet, views: Sequence[View], settings: Reconstruction | None = None) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass; no setting changes it.
 
     Raises:
         InputError: a picture more than `MAX_ASPECT` times as long as wide, or as wide as long.
@@ -150,3 +158,6 @@ def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> F
     if not np.isfinite(depth).all():
         raise ModelError("the depth of demo_net is not finite: expected numbers; is its file what was shipped?")
     return np.asarray(depth, np.float32)
+
+
+NETWORK = DepthNetwork("in the package", load_network, depth_of, preset="demo_net", warning=WHAT_IT_IS)

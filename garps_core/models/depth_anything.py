@@ -19,12 +19,16 @@ import torch
 from torch import Tensor, nn
 
 from garps_core.checks import Float32Array
-from garps_core.devices import checked_device
-from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
+from garps_core.config import Reconstruction
+from garps_core.devices import checked_device, on_device
+from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.models import vit
+from garps_core.models.depth_networks import DepthNetwork
 from garps_core.models.dpt import DptHead, Grid, enlarged
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
-from garps_core.weights.manifest import MAX_DEPTH_M
+from garps_core.types import View
+from garps_core.weights.load import load_weights
+from garps_core.weights.manifest import MAX_DEPTH_M, range_of
 from garps_core.weights.state_dict import load_strictly
 
 RGBImage = npt.NDArray[np.uint8]
@@ -52,6 +56,8 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 TRAINING_FX = 0.5 / np.tan(np.radians(60) / 2)
 """Focal length over image width of the indoor training's cameras: 60 deg wide."""
 DTYPES = {torch.float32, torch.float16, torch.bfloat16}
+AT_THE_END = 0.98
+"""Share of the network's largest depth; a pixel beyond it is at the end of the network's range."""
 
 
 class DepthAnythingV2(nn.Module):
@@ -68,6 +74,39 @@ class DepthAnythingV2(nn.Module):
         """(B, 3, H, W), normalised, sides multiples of 14 -> depth (B, H, W), float32, metres."""
         logit: Tensor = self.depth_head(self.pretrained(image, self.head.taps))
         return self.max_depth * logit.squeeze(1).float().sigmoid()
+
+
+def load_network(weights: str, scene: str, device: str) -> DepthAnythingV2:
+    """Read the weights by name or file ("" = the first installed) and build the network on the device.
+
+    scene: any, indoor or outdoor. Raises WeightsError, ConfigError, ModelError.
+    """
+    variant = "" if scene == "any" else scene
+    path, read = load_weights(weights, "depth_anything", variant)
+    network = built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
+    return on_device(network, device)
+
+
+def depths(network: DepthAnythingV2, views: Sequence[View], settings: Reconstruction) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass.
+
+    Raises ReconstructionError where most of a picture lies at the end of the network's range; else as `depth_of`.
+    """
+    images = [view.rgb for view in views]
+    fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
+    found = depth_of(network, images, fx=fx, dtype=getattr(torch, settings.network_dtype))
+    for view, depth, largest_m in zip(views, found, network.max_depth * focal_factors(images, fx), strict=True):
+        _check_range(view, depth, float(largest_m))
+    return found
+
+
+def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
+    far = float(np.mean(depth >= AT_THE_END * largest_m))
+    if far > 0.5:
+        raise ReconstructionError(
+            f"{far:.0%} of the network's depth of {view.frame_id or 'a view'} is {largest_m:g} m, all it can say: "
+            "expected rooms for indoor weights, streets for outdoor ones, and no relative model's"
+        )
 
 
 def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnythingV2:
@@ -246,3 +285,8 @@ def _pass(model: DepthAnythingV2, batch: Tensor, dtype: torch.dtype) -> Tensor:
 def _resized_back(depth: Tensor, size: Grid) -> Float32Array:
     """Depth (h, w) at the network's size -> at the image's, corner pixels on corner pixels."""
     return enlarged(depth[None, None], size)[0, 0].cpu().numpy()
+
+
+NETWORK = DepthNetwork(
+    "Depth Anything V2, metric, for rooms or for streets", load_network, depths, weights_kind="depth_anything"
+)

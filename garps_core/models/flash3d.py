@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from garps_core.errors import WeightsError
 from garps_core.models.resnet import FEATURE_CHANNELS, ResNet50
+from garps_core.weights.load import load_weights
 from garps_core.weights.state_dict import load_strictly
 
 LAYERS = 2
@@ -205,6 +206,11 @@ def flash3d_tensors(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dic
     read = {prefix + name for name in expected}
     left = Counter(_group_of(key, prefix) for key in state if key not in read)
     return found, dict(left)
+
+
+def load_network(weights: str) -> Flash3D:
+    """Read the weights by name or file ("" = the first installed) and build the network. Raises WeightsError."""
+    return flash3d_network(flash3d_tensors(load_weights(weights, "flash3d")[1].tensors)[0])
 
 
 def flash3d_network(tensors: Mapping[str, Tensor]) -> Flash3D:

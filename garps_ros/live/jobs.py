@@ -14,9 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from garps_core.align import estimate_with_mixtures
+from garps_core.align import Estimator
 from garps_core.config import Config
 from garps_core.geometry import se3_inverse
+from garps_core.models.in_use import Networks
 from garps_core.types import Mixture, PoseEstimate, Prior, View
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
 from garps_ros.estimates.outcomes import (
@@ -112,7 +113,7 @@ class JobRunner:
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+        self._say, self._networks = say, Networks()
         self._reader = ViewReader("auto", say)
         self._tracker: KeyframeTracker | None = None
         self._epoch = -1
@@ -128,7 +129,7 @@ class JobRunner:
     def prepare(self, config: Config) -> None:
         """Load networks and compile, so that the first job need not wait. Raises what `load_networks` does."""
         with self._in_stage("load networks"):
-            load_networks(config, self._say)
+            load_networks(config, self._say, self._networks)
             self.scale = scale_from(config)
         with self._in_stage("compile"):
             warm_up(config, self._say)
@@ -196,14 +197,14 @@ class JobRunner:
 
     def _completed(self, view: View) -> View:
         with self._in_stage("depth"):
-            return completed(view, self._job.config)
+            return completed(view, self._job.config, self._networks)
 
     def _estimate(self, source: View, target: View) -> PoseEstimate:
         config = self._job.config
         if len(self._job.frames) == 1:
             config = settings_of_completed(config)
         with self._in_stage("estimate"):
-            found, mixtures = estimate_with_mixtures(source, target, config, self._prior)
+            found, mixtures = Estimator(config, self._networks).estimate_with_mixtures(source, target, self._prior)
         if self._prior is not None:
             self._result.prior = self._use_of_prior(found)
         self._aligned = found, mixtures if self._job.clouds else None

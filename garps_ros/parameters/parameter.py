@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from garps_core.config import Config
+from garps_core.config.field import description
 from garps_core.errors import ConfigError
 from garps_ros.parameters.settings import NodeSettings
 
@@ -54,7 +55,7 @@ def _described(prefix: str, part: Any) -> Iterator[Parameter]:
         if dataclasses.is_dataclass(value):
             yield from _described(f"{prefix}{f.name}.", value)
         elif isinstance(value, Value):
-            yield Parameter(prefix + f.name, value, **f.metadata)
+            yield Parameter(prefix + f.name, value, **description(f))
 
 
 def settings_from(values: Mapping[str, Any]) -> tuple[NodeSettings, Config]:

@@ -24,6 +24,7 @@ from bench.rooms import make_pair
 from garps_core import View, metrics
 from garps_core.geometry import transform
 from garps_core.models import two_view_in_use
+from garps_core.models.in_use import Networks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 WITHIN_M = {
@@ -135,7 +136,7 @@ def test_a_network_of_random_parameters_knows_no_pose(name, pair, tmp_path, monk
 def test_a_network_that_tells_the_truth_is_believed(name, pair, monkeypatch) -> None:
     maps = point_maps((pair.source, pair.target), pair.T_target_source)
     told = dataclasses.replace(maps, metric=name == "mast3r")
-    monkeypatch.setattr(two_view_in_use, "pair_maps", lambda *_: told)
+    monkeypatch.setattr(Networks, "pair_maps", lambda *_: told)
     T, reason = METHODS[name](pair.source, pair.target, None)
     assert T is not None, reason
     assert e_3d_m(T, pair) < 0.01

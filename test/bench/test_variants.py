@@ -13,7 +13,7 @@ from bench.rooms import make_pair
 from bench.rows.evaluate import START, evaluate_pair
 from bench.rows.variants import VARIANTS, estimate, isotropic, last_rung, without_frustum
 from garps_core import Config, View, estimate_relative_pose
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

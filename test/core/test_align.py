@@ -13,7 +13,7 @@ from surfaces import FREE, TRUTH, disturbed, grey_at, look, off, room, two_mixtu
 import garps_core
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status, View, align_mixtures, estimate_relative_pose
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.start.initialise import initialise
 
 PUBLIC = {

@@ -22,7 +22,7 @@ from garps_core import (
 )
 from garps_core.config import Alignment, Rung
 from garps_core.config.lifting import Lifting
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 
 RGB = np.zeros((48, 64, 3), np.uint8)
 K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])

@@ -11,7 +11,7 @@ from garps_core.geometry import se3_exp
 PAPER = {
     "alignment.component_stride": 1,
     "alignment.opacity_threshold": 0.0,
-    "alignment.ladder": (Rung(90.0, 1000, 30, 5),),
+    "alignment.ladder": (Rung(covariance_scale=90.0, components=1000, neighbours=30, steps=5),),
 }
 CONFIGS = {
     "sensor": Config(),

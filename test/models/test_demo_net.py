@@ -17,11 +17,13 @@ from places import ROOT
 from garps_core import Config, View, estimate_relative_pose, metrics
 from garps_core.cli import command
 from garps_core.cli.doctor import examine
-from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
+from garps_core.config import PRESETS, depth_networks
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.mixtures.reconstruct import with_depth
-from garps_core.models import demo_net, in_use
+from garps_core.models import demo_net
 from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
+from garps_core.models.depth_networks import preset_for
+from garps_core.models.in_use import Networks
 from garps_core.weights.reader import read_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -134,7 +136,7 @@ def test_a_file_that_is_not_it_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_nothing_takes_it_but_who_asks_for_it(rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # nothing is installed
-    assert "demo_net" in DEPTH_NETWORKS
+    assert "demo_net" in depth_networks()
     naming = [name for name in PRESETS if Config.preset(name).reconstruction.method == "demo_net"]
     assert naming == ["demo_net"]
     for preset in ("monocular", "paper"):
@@ -157,7 +159,7 @@ def test_it_is_called_a_demonstration(
 ) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # loaded anew
     with caplog.at_level(logging.WARNING, "garps_core"):
-        assert isinstance(in_use.demonstration(), DemoNet)
+        assert isinstance(Networks().depth_network(Config.preset("demo_net")), DemoNet)
     assert f"demo_net is {DEMONSTRATION}" in caplog.text
     rows, _ = examine()
     assert DEMONSTRATION in dict(rows)["demo_net"]

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from garps_core import Config
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.models.semantics import BAND_ROWS, Segmenter, labelled, prepared, scores_of, segment, segmenter_of
 from garps_core.types import View
 

@@ -14,7 +14,7 @@ import cv2
 import pytest
 import torch
 from box_room import K_WORDS
-from network_weights import DEPTH, FLASH3D, install, install_reduced, passes, reduced_tensors, write_pair
+from network_weights import DEPTH, FLASH3D, install, install_reduced, passes, reduced_tensors, shared, write_pair
 from safetensors.torch import save_file
 from small_mask2former import ADAPTER, HEAD, random_state
 
@@ -104,7 +104,7 @@ NO_FIT = "trusted pixels fit one pose: expected at least 20%"
 @pytest.mark.parametrize("name", [MAST3R, PTH])
 def test_two_pictures_and_nothing_else(files: Files, name: str, capsys: Captured) -> None:
     """Depth of both views and a try at the pose from one look at the pair; both layouts say the same."""
-    network = two_view_in_use.two_view_model(Config.preset("mast3r").replace({"start.weights": name})).network
+    network = shared().two_view(Config.preset("mast3r").replace({"start.weights": name})).network
     with passes(network.patch_embed) as seen:
         out = aligned(capsys, files, "--preset", "mast3r", *K_WORDS, *with_weights(f"weights={name}"))
         assert seen == [(2, 3, 96, 128)]
@@ -319,7 +319,7 @@ def test_the_licence_is_told_as_weights_are_loaded(
     for name in (MAST3R, PTH, *DUST3R, str(tmp_path / "renamed.safetensors")):
         kind = BY_NAME[name].kind if name in BY_NAME else MAST3R
         with caplog.at_level(logging.WARNING, "garps_core"):
-            two_view_in_use.two_view_model(Config().replace({"start.method": kind, "start.weights": name}))
+            shared().two_view(Config().replace({"start.method": kind, "start.weights": name}))
         (told,) = [record for record in caplog.records if record.name == "garps_core"]
         assert told.levelno == logging.WARNING
         file = BY_NAME[name].local if name in BY_NAME else "renamed.safetensors"
@@ -344,7 +344,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
     def opened(*given: object) -> None:
         pytest.fail(f"asked for {given}")
 
-    monkeypatch.setattr(two_view_in_use, "tensors_of", opened)
+    monkeypatch.setattr(two_view_in_use, "load_weights", opened)
     for name in PRESETS:
         if name not in ("mast3r", "paper", "paper_full"):
             assert command.main(["align", files["a"], files["b"], *K_WORDS, *depths(files), "--preset", name]) in (0, 1)

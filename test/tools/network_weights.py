@@ -16,7 +16,8 @@ from box_room import TRUTH, K, room
 from safetensors.torch import save_file
 from torch import nn
 
-from garps_core import View
+from garps_core import View, align
+from garps_core.models.in_use import Networks
 from garps_core.models.two_view import Architecture, Stack, TwoView
 from garps_core.weights.manifest import BY_NAME
 
@@ -57,6 +58,11 @@ def write_pair(folder: Path) -> dict[str, str]:
         cv2.imwrite(paths[name], view.rgb[:, :, ::-1])
         cv2.imwrite(paths[f"{name}_mm"], np.rint(view.depth * 1000).astype(np.uint16))
     return paths
+
+
+def shared() -> Networks:
+    """The networks that `estimate_relative_pose` uses."""
+    return align.NETWORKS
 
 
 @contextmanager

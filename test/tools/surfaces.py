@@ -12,7 +12,7 @@ import torch
 
 from garps_core import Config, Mixture, Prior, View
 from garps_core.geometry import pixel_rays, ros_from_twist, se3_exp, se3_inverse, transform
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 
 torch.set_num_threads(1)  # threads that wait for each other on a shared machine cost more than they bring
 

@@ -12,8 +12,8 @@ from garps_core import Config
 from garps_core.depth_errors import error_sigmas
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
-from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import brightness_of
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective import brightness
 from garps_core.objective.brightness import fit_brightness
 

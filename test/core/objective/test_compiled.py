@@ -23,7 +23,7 @@ from garps_core.objective.pairs import image_coordinates, pair_up, to_device, vi
 needs_numba = pytest.mark.skipif(not compiled.AVAILABLE, reason="numba is not installed")
 CLOSE = 1e-5
 SETTINGS = Alignment(colour_variance=0.05, outlier_floor=0.01)
-RUNG = Rung(4.0, 4000, 10, 1)
+RUNG = Rung(covariance_scale=4.0, components=4000, neighbours=10, steps=1)
 KINDS = ("surface", "scattered")
 
 

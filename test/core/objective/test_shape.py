@@ -32,7 +32,7 @@ SEEDS = st.integers(0, 10**6)
 
 def all_pairs(rows=ROWS, partners=PARTNERS, T=POSE, scale=2.0, config=DOUBLE, alignment=SETTINGS, k=None, form="log"):
     """The package's pairs, by default every row with every partner; "sum" has no outlier floor."""
-    rung = Rung(scale, 1000, k or len(partners), 1)
+    rung = Rung(covariance_scale=scale, components=1000, neighbours=k or len(partners), steps=1)
     pairs = pair_up(to_device(rows, config), to_device(partners, config), T, rung, alignment)
     return without_floor(pairs) if form == "sum" else pairs
 

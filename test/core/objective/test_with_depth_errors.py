@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
 from garps_core import Config, Prior, Status, align_mixtures
-from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
-from garps_core.mixtures import reconstruct
+from garps_core.mixture_alignment import _known
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information
 from garps_core.objective.state import State
@@ -36,7 +36,7 @@ SEEDS = st.integers(0, 10**6)
 
 def pairs_of(rows_seed=1, partners_seed=2, T=POSE):
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (rows_seed, partners_seed))
-    return pair_up(rows, partners, T, Rung(2.0, 1000, 9, 1), SETTINGS)
+    return pair_up(rows, partners, T, Rung(covariance_scale=2.0, components=1000, neighbours=9, steps=1), SETTINGS)
 
 
 FORWARD, BACKWARD = pairs_of(), pairs_of(2, 1, se3_inverse(POSE))
@@ -150,7 +150,11 @@ def test_corrected_points_stay_on_their_rays():
 def test_correcting_the_clouds_is_evaluating_with_the_errors():
     """Of the rows to the last digit: what the solver does between its rungs changes nothing."""
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
-    errors, rung, far = drawn(6, 0.03)[:MODES], Rung(2.0, 1000, 60, 1), replace(SETTINGS, max_distance_m=100.0)
+    errors, rung, far = (
+        drawn(6, 0.03)[:MODES],
+        Rung(covariance_scale=2.0, components=1000, neighbours=60, steps=1),
+        replace(SETTINGS, max_distance_m=100.0),
+    )
     of_corrected = pair_up(corrected(rows, errors), partners, POSE, rung, far)
     plain = pair_up(rows, partners, POSE, rung, far)
     got = evaluate_jointly(of_corrected, POSE, NONE, NONE)

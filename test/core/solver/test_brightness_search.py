@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from surfaces import off, room
 
-from garps_core import Config, align
-from garps_core.mixtures import reconstruct
+from garps_core import Config, mixture_alignment
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.solver import search
 from garps_core.solver.brightness_search import PURSUED, search_by_brightness
 from garps_core.start.initialise import identity
 
-KNOWN = align._known(identity(Config(), ""), Config())
+KNOWN = mixture_alignment._known(identity(Config(), ""), Config())
 AROUND = search.starting_poses(KNOWN, search.FINE_RINGS)
 
 

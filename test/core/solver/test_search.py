@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
+from garps_core import Config, Status, align_mixtures, estimate_relative_pose, mixture_alignment
 from garps_core.geometry import se3_inverse, se3_log
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import to_device
 from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, search
@@ -78,7 +78,7 @@ def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeyp
     settings, asked = Config().alignment, []
     by_shape = search._by_shape
     monkeypatch.setattr(search, "_by_shape", lambda *given: asked.append(1) or by_shape(*given))
-    known = align._known(identity(Config(), ""), Config())
+    known = mixture_alignment._known(identity(Config(), ""), Config())
     solutions = search.search(x, y, known, settings)
     found = [next(solutions)]
     assert not asked, "the first is found by sight"
@@ -95,14 +95,14 @@ def test_solutions_are_seen_closely_and_found_only_as_they_are_asked_for(monkeyp
 def test_a_convincing_solution_ends_the_search(monkeypatch):
     source, target, _ = room(1, 4)
     mixtures = [reconstruct(view) for view in (source, target)]
-    start, followed, searched = identity(Config(), ""), {}, align.search
+    start, followed, searched = identity(Config(), ""), {}, mixture_alignment.search
 
     def counted(*given):
         for solution in searched(*given):
             followed[enough] = followed.get(enough, 0) + 1
             yield solution
 
-    monkeypatch.setattr(align, "search", counted)
+    monkeypatch.setattr(mixture_alignment, "search", counted)
     for enough in (-1.0, 1.0):
         config = Config().replace({"alignment.enough_correlation": enough, "alignment.brightness_measurements": 0.05})
         estimate = align_mixtures(*mixtures, start, config)
@@ -119,8 +119,8 @@ def test_poses_that_lie_together_are_one():
 def test_a_precise_start_is_not_searched_from(monkeypatch):
     """What decides is how far scene points may be off, as a share of their range."""
     mixtures, calls = two_mixtures(), []
-    searched = align.search
-    monkeypatch.setattr(align, "search", lambda *given: calls.append(given) or searched(*given))
+    searched = mixture_alignment.search
+    monkeypatch.setattr(mixture_alignment, "search", lambda *given: calls.append(given) or searched(*given))
     assert align_mixtures(*mixtures, disturbed()).ok and not calls
     assert align_mixtures(*mixtures, disturbed(covariance=16 * FREE)).ok and len(calls) == 1
 

@@ -15,7 +15,7 @@ from garps_core import Config, Mixture, Prior, align_mixtures
 from garps_core.depth_errors import FIELD_SLOPE, depth_sigma, error_fields, error_sigmas
 from garps_core.geometry import inverted, ros_from_twist, se3_exp, se3_inverse, twist_from_ros
 from garps_core.metrics import pose_error
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.verdict.covariance import inflated
 
 SMALL = {"camera": np.diag([0.5, 0.5, 1]) @ surfaces.K, "size": (60, 80)}

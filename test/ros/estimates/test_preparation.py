@@ -6,13 +6,14 @@ import csv
 import calm_network
 import numpy as np
 import pytest
+from network_weights import shared
 from recordings import PERIOD, START, write
 from ros_messages import camera_info, image
 
 from garps_core import Config, estimate_relative_pose
 from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
-from garps_core.models import depth_anything, in_use
+from garps_core.models import depth_anything
 from garps_ros import replay
 from garps_ros.estimates import preparation
 from garps_ros.estimates.outcomes import Origin
@@ -47,7 +48,8 @@ def installed(weights, monkeypatch):
 def passes():
     """Number of pictures that enter the network, pass by pass."""
     entered = []
-    hook = in_use.depth_network("", "any").register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
+    network = shared().depth_network(CONFIG)
+    hook = network.register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
     yield entered
     hook.remove()
 
