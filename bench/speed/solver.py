@@ -13,12 +13,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.peers.autograd import PlainObjective
-from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import to_device
-from garps_core.objective.shape import Pairs, evaluate, unpack
+from garps_core.objective.shape import Pairs, evaluate
 from garps_core.objective.state import State
 from garps_core.solver import ladder, paper
 

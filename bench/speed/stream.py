@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 from torch import Tensor
 
-from bench.speed.parts import Check, Inputs, Row, Section, imported_numba, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, imported_numba, interleaved, medians, threads
 from garps_core import Config, Mixture
 from garps_core.checks import Float64Array
 from garps_core.config import Rung

@@ -16,7 +16,6 @@ from surfaces import moved, permuted, random_mixture, random_pose
 from garps_core import Config
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import adjoint, se3_exp, se3_inverse
-from garps_core.objective import shape
 from garps_core.objective.pairs import pair_up, to_device, without_floor
 from garps_core.objective.shape import evaluate
 from garps_core.objective.state import State
@@ -234,7 +233,7 @@ def assert_same(a, b, tolerance):
 def test_size_of_the_chunks_does_not_matter(form, chunk, monkeypatch):
     pairs = all_pairs(k=9, form=form)
     plain = evaluate(pairs, POSE, form)
-    monkeypatch.setattr(shape, "CHUNK_PAIRS", chunk)
+    monkeypatch.setattr("garps_core.objective.plain.CHUNK_PAIRS", chunk)
     assert_same(evaluate(pairs, POSE, form), plain, 1e-10)
 
 
