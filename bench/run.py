@@ -105,7 +105,7 @@ def _known(what: str, names: list[str], known: Sequence[str]) -> list[str]:
 def config_for(depth: str, settings: Path | None, change: Sequence[str]) -> Config:
     """Settings of GARPS for a depth: its preset, then the file, then single changes."""
     config = config_of(depth)
-    return changed_config(config if settings is None else read_settings(settings, config), change)
+    return changed_config(config if settings is None else read_settings(settings, config, DEPTHS[depth]), change)
 
 
 def main(

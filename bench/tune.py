@@ -6,7 +6,7 @@
     python -m bench.tune --depth monocular --data pairs=FOLDER --data bare=out/bare_rooms
 
 The best settings are written to --out as DEPTH.yaml: for `garps align --settings`, `garps-replay --settings`,
-`python -m bench.run --settings` and, as a file of parameters, for the node.
+`python -m bench.run --settings` and the node's parameter `settings_file`.
 
 Settings are chosen on the dev half of recorded pairs and on the generated rooms to tune on (`bench.run --half dev`):
 sensor depth on recorded pairs, monocular depth on these and bare rooms, the demonstration network's on its own rooms.

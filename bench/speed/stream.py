@@ -53,9 +53,8 @@ def exact_pairs(mixtures: tuple[Mixture, Mixture], T: Float64Array, n: int, k: i
     if len(rows) < n:
         raise ValueError(f"the mixture has {len(rows)} components, {n} rows are wanted: give larger images")
     scale = config.alignment.ladder[-1].covariance_scale
-    return pair_up(
-        thin(rows, n), partners, T, Rung(covariance_scale=scale, components=n, neighbours=k), config.alignment
-    )
+    rung = Rung(covariance_scale=scale, components=n, neighbours=k)
+    return pair_up(thin(rows, n), partners, T, rung, config.alignment)
 
 
 def _planes(pairs: Pairs) -> list[Tensor]:
