@@ -170,7 +170,7 @@ def depth_from(views: Sequence[View], config: Config) -> str:
 
 
 def with_weights(settings: Reconstruction) -> str:
-    """The depth network of the settings with its weights or, where it has none of the list, with what it is.
+    """The depth network of the settings with its warning, else with its weights or, without any, its description.
 
     Raises WeightsError where weights of the list are needed and none are installed.
     """
@@ -178,4 +178,4 @@ def with_weights(settings: Reconstruction) -> str:
     network, weights = depth_network(name), settings.depth_weights
     if network.weights_kind and not weights:
         weights = default(network.weights_kind, "" if settings.scene == "any" else settings.scene).name
-    return f"{name} ({f'weights {weights}' if weights else network.warning or network.description})"
+    return f"{name} ({network.warning or (f'weights {weights}' if weights else network.description)})"
