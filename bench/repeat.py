@@ -16,8 +16,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
+from bench.rows.row import Row
 from bench.rows.row_log import ROWS, key_of
-from bench.scoring.tables import Row
 
 
 class Differences(NamedTuple):

@@ -28,8 +28,8 @@ from rich.progress import Progress
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from bench.scoring.depth_errors import DepthErrors, depth_errors
-from bench.scoring.tables import machine_facts
+from bench.machine.facts import machine_facts
+from bench.rows.depth_errors import DepthErrors, depth_errors
 from bench.training.pictures import BATCH, Pictures, batches
 from bench.training.rooms import FIRST_SEED, FOLDER, render
 from garps_core.models.demo_net import FILE, WHAT_IT_IS, DemoNet, Unit

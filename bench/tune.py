@@ -6,7 +6,7 @@
     python -m bench.tune --depth monocular --data pairs=FOLDER --data bare=out/bare_rooms
 
 The best settings are written to --out as DEPTH.yaml: for `garps align --settings`, `garps-replay --settings`,
-`python -m bench.run --settings` and, as a file of parameters, for the node.
+`python -m bench.run --settings` and the node's parameter `settings_file`.
 
 Settings are chosen on the dev half of recorded pairs and on the generated rooms to tune on (`bench.run --half dev`):
 sensor depth on recorded pairs, monocular depth on these and bare rooms, the demonstration network's on its own rooms.
@@ -33,24 +33,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from bench.pairs.datasets import Pair
-from bench.pairs.sources import (
-    BARE,
-    DEMO_NET,
-    MONOCULAR,
-    PAIRS,
-    ROOMS,
-    SENSOR,
-    config_of,
-    defaults_of,
-    named,
-    pairs_of,
-    sources_there,
-    usable,
-    with_depth_of,
-)
-from bench.rows.evaluate import evaluate
-from bench.scoring.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
+from bench.pairs.depths import DEMO_NET, MONOCULAR, SENSOR, config_of, usable, with_depth_of
+from bench.pairs.pair import Pair
+from bench.pairs.sources import BARE, PAIRS, ROOMS, defaults_of, named, pairs_of, sources_there
+from bench.rows.pair_rows import rows_of_pairs
+from bench.rows.row import GARPS, Row
+from bench.scoring.summary import MAP_FREE_DEG, MAP_FREE_M, is_right
 from garps_core import Config, GarpsError
 from garps_core.config.text import write_settings
 from garps_core.metrics import CHI2_6_95
@@ -115,7 +103,7 @@ class Part(NamedTuple):
 def run(config: Config, planned: Sequence[Part]) -> Iterator[list[Row]]:
     """GARPS' rows of one table after the other."""
     for part in planned:
-        rows = evaluate(config, _pairs(part.depth, part.source, part.half, part.limit), part.start, [GARPS])
+        rows = rows_of_pairs(config, _pairs(part.depth, part.source, part.half, part.limit), part.start, [GARPS])
         yield [row for row in rows if row["method"] == GARPS]
 
 

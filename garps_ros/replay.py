@@ -34,6 +34,7 @@ from garps_ros.estimates.preparation import (
     settings_of_completed,
 )
 from garps_ros.frames.frame import CameraTopics
+from garps_ros.parameters.settings import RECTIFIED, NodeSettings, current_rectified
 from garps_ros.recording.bags import Bag, BagError
 from garps_ros.recording.frame_reader import Frames
 from garps_ros.recording.outputs import Outputs
@@ -45,7 +46,6 @@ from msg_adapters import NANOSECONDS
 NAME = "garps-replay"
 INTERRUPTED = 130
 ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
-ONE_OF_RECTIFIED = ("auto", "true", "false")
 GIVEN = "COMMANDLINE"
 LIVE_OPTIONS = {"rate", "loop", "topics", "wait"}
 """Options that need --to-ros."""
@@ -136,26 +136,31 @@ def replay(
     ] = "auto",
     slop: Annotated[
         float, typer.Option(help="Largest difference of stamps that belong together, seconds.", min=0, max=10)
-    ] = 0.02,
+    ] = NodeSettings.sync_slop,
     rectified: Annotated[
-        str, typer.Option(help="Are the images rectified? auto (by topic name), true, false.")
-    ] = "auto",
+        str, typer.Option(help="Kind of the images: rectified, raw, or auto (by topic name).")
+    ] = NodeSettings.rectified,
     keyframe_overlap: Annotated[
         float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)
-    ] = 0.5,
-    keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
-    keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
+    ] = NodeSettings.keyframe_overlap,
+    keyframe_motion: Annotated[
+        float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)
+    ] = NodeSettings.keyframe_motion,
+    keyframe_rotation: Annotated[
+        float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)
+    ] = NodeSettings.keyframe_rotation,
     keyframe_lost_after: Annotated[
-        int, typer.Option(help="New trajectory after this many frames in a row without a pose.", min=1, max=1000)
-    ] = 5,
+        int, typer.Option(help="New trajectory after this number of frames in a row without a pose.", min=1, max=1000)
+    ] = NodeSettings.keyframe_lost_after,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Preset = None,
     reconstruction: Reconstruction = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+        list[str] | None,
+        typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+        Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
     ] = None,
     to_ros: ToRos = False,
     rate: Rate = 1.0,
@@ -168,7 +173,8 @@ def replay(
     if to_ros:
         return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
-    _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
+    rectified = current_rectified(rectified)
+    _check_choice("--rectified", rectified, RECTIFIED)
     config = _configured(preset, reconstruction, settings, set_ or [])
     rule = KeyframeRule(
         keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after, depth_share(config)
@@ -191,10 +197,13 @@ def _configured(preset: str | None, method: str | None, file: Path | None, chang
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
 
     def changed(base: Config) -> Config:
-        return changed_config(base if file is None else read_settings(file, base), changes)
+        return changed_config(base if file is None else read_settings(file, base, preset), changes)
 
-    asked = changed(Config())
-    config = changed(Config.preset(preset or preset_for(asked.reconstruction.method, needs_depth(asked))))
+    if preset is None:
+        asked = changed(Config())
+        config = changed(Config.preset(preset_for(asked.reconstruction.method, needs_depth(asked))))
+    else:
+        config = changed(Config.preset(preset))
     check_method(config)
     return config
 

@@ -35,13 +35,12 @@ from bench.demo.picture import with_inputs
 from bench.demo.rgb import rgb_part
 from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
 from bench.rooms import RoomPair, make_pair
-from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
+from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.cli.figure import before_after
-from garps_core.mixtures.reconstruct import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:
-    from bench.demo.live import LivePose  # needs rclpy
+    from bench.demo.live import LivePose
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""

@@ -9,10 +9,8 @@ output, which means nothing: with it the start and the alignment cost what they 
 from __future__ import annotations
 
 import os
-import resource
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,8 +20,9 @@ import cv2
 import numpy as np
 import torch
 
+from bench.machine.cost import peak_mib, seconds_of
+from bench.report.checks import Row
 from bench.rooms import RoomPair, make_pair
-from bench.speed.parts import Row
 from garps_core import Config, PoseEstimate, View, estimate_relative_pose
 from garps_core.align import NETWORKS
 from garps_core.models.depth_anything import DepthAnythingV2
@@ -80,18 +79,6 @@ def measured_pair(method: str, runs: int, threads: int) -> Row:
     wall, cpu = (statistics.median(one[i] for one in whole) for i in (0, 1))
     told = {"wall s": wall, "CPU s": cpu, "peak MiB": peak, "beyond imports MiB": peak - imported}
     return {"reconstruction.method": method} | stages | told | {"status": found[-1].status.value}
-
-
-def seconds_of(action: Callable[[], Any]) -> tuple[float, float]:
-    """Wall and CPU seconds, the latter of all threads."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    action()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def peak_mib() -> float:
-    """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def pair_lines(runs: int, threads: int) -> list[Row]:

@@ -14,10 +14,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench.pairs.bare import SET as BARE_ROOMS
+from bench.pairs.bare_rooms import SET as BARE_ROOMS
 from bench.pairs.learned_rooms import SET as LEARNED_ROOMS
+from bench.rows.row import GARPS, START, Row
 from bench.scoring.intervals import Difference, paired_difference
-from bench.scoring.tables import GARPS, START, Row, coverage, quality_auc, summarise
+from bench.scoring.summary import coverage, quality_auc, summarise
 
 REGISTRATION = ("open3d-gicp", "open3d-colored", "open3d-plane", "small-gicp", "rgbd-hybrid", "rgbd-intensity")
 BARE_PEERS = ("sift-pnp", "open3d-gicp", "open3d-colored", "kiss-matcher+gicp")

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.peers.baselines import METHODS, NEED_NO_START
-from bench.scoring.tables import ERRORS, Row
+from bench.peers.methods import METHODS, NEED_NO_START
+from bench.rows.row import ERRORS, Row
 
 ROWS, PREVIOUS = "rows.jsonl", "rows.previous.jsonl"
 Key = tuple[str, str, str, str]

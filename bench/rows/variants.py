@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.pairs.datasets import Pair
-from bench.scoring.tables import GARPS
+from bench.pairs.pair import Pair
+from bench.rows.row import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
 from garps_core.align import NETWORKS
 from garps_core.errors import GarpsError, InitialisationError
@@ -95,7 +95,7 @@ VARIANTS: dict[str, Variant] = {
 """By the name that stands in tables."""
 
 
-def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) -> PoseEstimate:
+def variant_estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) -> PoseEstimate:
     """The estimate of a variant from a given pose, or from whatever the settings start with. Never raises on data."""
     of_start, config = config, variant.config(config)
     if not variant.same_start:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,14 +14,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.peers.autograd import PlainObjective
-from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import to_device
-from garps_core.objective.shape import Pairs, evaluate, unpack
-from garps_core.objective.state import State
+from garps_core.objective.shape import Pairs, evaluate
+from garps_core.objective.state import State, WeightedStart
 from garps_core.solver import ladder, paper
+from garps_core.solver.problem import Problem
 
 PAPER_BAR, AUTOGRAD_BAR = 40.0, 200.0
 PLAIN_STEPS = 5
@@ -57,10 +61,10 @@ class Contest:
     def same_problem(self) -> Float64Array:
         """End pose of the default solver's steps on what the paper's solver works on: its objective, its pairs."""
         pairs, start = self.paper_pairs(), State(self.prior.T_target_source)
-        known = ladder.WeightedStart(start.T, 1e-9 * np.eye(6))
+        weak = WeightedStart(start.T, 1e-9 * np.eye(6))
 
         def function(at: State) -> ladder.Posterior:
-            return ladder.posterior(evaluate(pairs, at.T, "sum"), at, known, 1.0)
+            return ladder.posterior(evaluate(pairs, at.T, "sum"), at, weak, 1.0)
 
         return ladder.ascend(function, start, SAME_STEPS, 1e-3).at.T
 
@@ -74,7 +78,9 @@ class Contest:
         """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
         config = self.configs[DEFAULT]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[DEFAULT])
-        pairs = ladder.rung_pairs(source, target, T, rung, config.alignment, config.alignment.partner_density)
+        with ThreadPoolExecutor(1) as pool:
+            problem = Problem(source, target, WeightedStart(T, np.eye(6)), config, pool)
+            pairs = ladder.rung_pairs(problem, T, rung, config.alignment.partner_density)
         if pairs is None:
             raise RuntimeError("fewer than 50 components are seen by both views: give another pair")
         return pairs
@@ -125,10 +131,14 @@ def objectives(held: Contest, ends: dict[str, PoseEstimate]) -> dict[str, tuple[
     """
     one_way = held.paper_pairs()
     both_ways = held.rung_pairs(held.configs[DEFAULT].alignment.ladder[-1], pose_of(ends[DEFAULT]))
-    return {
-        name: (evaluate(one_way, pose_of(end), "sum").value, ladder.two_way(*both_ways, State(pose_of(end))).value)
-        for name, end in ends.items()
-    }
+    with ThreadPoolExecutor(1) as pool:
+        return {
+            name: (
+                evaluate(one_way, pose_of(end), "sum").value,
+                ladder.two_way(*both_ways, State(pose_of(end)), pool).value,
+            )
+            for name, end in ends.items()
+        }
 
 
 def pose_of(end: PoseEstimate) -> Float64Array:

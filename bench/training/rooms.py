@@ -22,8 +22,8 @@ import numpy.typing as npt
 import typer
 from rich.progress import Progress
 
-from bench.pairs.bare import in_the_dark
 from bench.rooms import Room, look_at, make_room
+from bench.rooms.dark import in_the_dark
 from bench.rooms.mesh import Array
 from bench.rooms.shading import camera_rays, room_gain
 from bench.rooms.textures import Texture
@@ -40,7 +40,7 @@ TRIED = 3
 """Cameras per picture, of which the one that sees farthest is kept: else half of all pictures were a piece of wall."""
 CLEARANCE_M = 0.2
 DARK_SHARE = 0.2
-"""Of the pictures, taken in the dark by a moving camera (`bench.pairs.bare`)."""
+"""Of the pictures, taken in the dark by a moving camera (`bench.rooms.dark`)."""
 VERSION = 1
 
 

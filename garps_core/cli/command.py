@@ -37,10 +37,11 @@ ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
 Settings = Annotated[
-    Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+    Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
 ]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
@@ -134,9 +135,12 @@ def align(
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
     options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    method = _configured(Config(), settings, set_, options).reconstruction.method
-    base = Config.preset(preset or preset_for(method, splats or any(depths)))
-    config = _configured(base, settings, set_, options)
+    if preset is None:
+        method = _configured(Config(), None, settings, set_, options).reconstruction.method
+        base = Config.preset(preset_for(method, splats or any(depths)))
+    else:
+        base = Config.preset(preset)
+    config = _configured(base, preset, settings, set_, options)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -236,9 +240,11 @@ def _uncalibrated(
     return source, target, maps
 
 
-def _configured(base: Config, file: Path | None, changes: list[str] | None, options: dict[str, str | None]) -> Config:
+def _configured(
+    base: Config, preset: str | None, file: Path | None, changes: list[str] | None, options: dict[str, str | None]
+) -> Config:
     given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(base if file is None else read_settings(file, base), changes or []).replace(given)
+    config = changed_config(base if file is None else read_settings(file, base, preset), changes or []).replace(given)
     checked_device(config.device)
     return config
 

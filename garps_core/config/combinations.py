@@ -7,7 +7,7 @@ from garps_core.config.config import Config
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import (
     ConfigError,
-    ReconstructionError,
+    MissingDepthError,
 )
 
 
@@ -24,7 +24,7 @@ def check_settings(config: Config) -> None:
     if config.alignment.depth_errors or config.alignment.solver == "adam":
         return
     if config.reconstruction.method == "auto":
-        raise ReconstructionError(
+        raise MissingDepthError(
             "the view has no depth: expected HxW float32 metres; give View(..., depth=...), or take the preset "
             "monocular, which asks a network"
         )

@@ -15,6 +15,7 @@ from garps_core.config.field import Checked, flattened, replaced, setting
 from garps_core.config.ladders import NETWORK, NETWORK_SEARCH, PAPER
 from garps_core.config.lifting import Lifting
 from garps_core.config.reconstruction import Reconstruction
+from garps_core.config.renamed import current
 from garps_core.config.start import Start
 from garps_core.errors import ConfigError
 
@@ -27,9 +28,9 @@ class Config(Checked):
     lifting: Lifting = Lifting()
     start: Start = Start()
     alignment: Alignment = Alignment()
-    device: str = setting("cpu", "where the objective runs: cpu, cuda, cuda:0 ...")
-    dtype: str = setting("float32", "arithmetic of the objective", choices=("float32", "float64"))
-    seed: int = setting(0, "seed of the robust estimators", low=0, high=2**31 - 1)
+    device: str = setting("cpu", "device of the objective and of the networks: cpu, cuda, cuda:0 ...")
+    dtype: str = setting("float32", "arithmetic of the objective", choices=("float32", "float64"), expert=True)
+    seed: int = setting(0, "seed of the random numbers of robust estimators", low=0, high=2**31 - 1, expert=True)
 
     @classmethod
     def preset(cls, name: str) -> Config:
@@ -39,9 +40,14 @@ class Config(Checked):
         return PRESETS[name]()
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
-        """A copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Raises ConfigError on a typo."""
+        """Return a copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Names of old work too.
+
+        Raises:
+            ConfigError: a name that is no setting, or a value out of range.
+        """
         config: Config = self
-        for name, value in changes.items():
+        for given, value_given in changes.items():
+            name, value = current(given, value_given)
             config = replaced(config, name, name.split("."), value)
         return config
 

@@ -24,6 +24,7 @@ def setting(
     high: float | None = None,
     choices: Choices = (),
     live: bool = True,
+    expert: bool = False,
 ) -> Any:
     """Return a dataclass field with its meaning, unit and allowed values; help and parameters are generated from it.
 
@@ -36,9 +37,10 @@ def setting(
         choices: the words a text may take, or a function that returns them; a function is called whenever they are
             needed, never at import.
         live: the setting may be changed while a node runs.
+        expert: only somebody who tunes the algorithm needs the setting; it is no parameter of a node.
     """
-    described = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
-    return field(default=default, metadata=described)
+    limits = {"unit": unit, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata={"doc": doc, **limits, "live": live, "expert": expert})
 
 
 def description(f: dataclasses.Field[Any]) -> dict[str, Any]:
@@ -104,7 +106,7 @@ def replaced(part: Any, name: str, path: list[str], value: Any, whole: Any = Non
     names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
     if path[0] not in names:
         near = difflib.get_close_matches(name, [known for known, _ in flattened("", whole)], n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else "expected one of the names that Config().settings() lists"
+        hint = f"did you mean {near[0]!r}?" if near else "docs/parameters.md lists all names"
         raise ConfigError(f"setting {name!r} does not exist; {hint}")
     if len(path) > 1:
         value = replaced(getattr(part, path[0]), name, path[1:], value, whole)

@@ -39,7 +39,8 @@ def reconstruct(view: View, config: Config | None = None, networks: Networks | N
     Returns:
         Mixture, components along a Z-order curve (but in the published order for the paper's solver).
     Raises:
-        ReconstructionError: no depth where a sensor's is wanted, or too few usable pixels.
+        MissingDepthError: no depth where a sensor's is wanted.
+        ReconstructionError: too few usable pixels, or depth beyond the network's range.
         ConfigError: settings that do not go together.
         WeightsError: weights that are not installed, or not what they should be.
         ModelError: a network that does not fit the memory, or whose output is not finite.

@@ -88,12 +88,12 @@ def drawn_room(height: int = 240, width: int = 320) -> tuple[Picture, Float32Arr
 
 
 def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Finding]:
-    from garps_core.models.depth_anything import built_from, depth_of
+    from garps_core.models.depth_anything import built_from, depth_of_images
 
     model = built_from(found.tensors, max_depth)
     yield "shapes", f"Depth Anything V2 of width {model.pretrained.cls_token.shape[-1]}", True
     picture, true = drawn_room()
-    (depth,) = depth_of(model, [picture])
+    (depth,) = depth_of_images(model, [picture])
     low, median, high = (float(x) for x in np.percentile(depth, (5, 50, 95)))
     words = f"{low:.2f} .. {median:.2f} .. {high:.2f} m (5, 50, 95 %)"
     yield "depth", words, low >= LOW_M and high <= SATURATED * max_depth

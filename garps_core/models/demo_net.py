@@ -89,7 +89,7 @@ class DemoNet(nn.Module):
         self.answer = nn.Conv2d(CHANNELS[0], 1, 3, padding=1)
 
     def forward(self, picture: Tensor) -> Tensor:
-        """(B, 5, 192, 256) of `prepared` -> logarithm of depth (m) over focal length (as the unit), (B, 96, 128)."""
+        """(B, 5, 192, 256) of `demo_input` -> logarithm of depth (m) over focal length (as the unit), (B, 96, 128)."""
         maps = []
         x = picture
         for level in self.down:
@@ -116,7 +116,7 @@ def shipped() -> DemoNet:
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
+def demo_input(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
     """HxWx3 uint8 and 3x3 K (pixel centres at integers) -> input (5, 192, 256), and the focal length as the unit."""
     height, width = rgb.shape[:2]
     scale_x, scale_y = WIDTH / width, HEIGHT / height
@@ -131,7 +131,9 @@ def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Fl
     return found, float(np.sqrt(fx * fy) / UNIT_FOCAL_PX)
 
 
-def depth_of(network: DemoNet, views: Sequence[View], settings: Reconstruction | None = None) -> list[Float32Array]:
+def depth_of_views(
+    network: DemoNet, views: Sequence[View], settings: Reconstruction | None = None
+) -> list[Float32Array]:
     """Depth of each view, HxW float32 m along z, all in one pass; no setting changes it.
 
     Raises:
@@ -142,7 +144,7 @@ def depth_of(network: DemoNet, views: Sequence[View], settings: Reconstruction |
         height, width = view.rgb.shape[:2]
         if max(height, width) > MAX_ASPECT * min(height, width):
             raise InputError(f"rgb is {width}x{height}: expected sides within a factor of {MAX_ASPECT} for demo_net")
-    inputs, focals = zip(*(prepared(view.rgb, view.K) for view in views), strict=True)
+    inputs, focals = zip(*(demo_input(view.rgb, view.K) for view in views), strict=True)
     device = next(network.parameters()).device
     with torch.inference_mode():
         logarithms = network(torch.from_numpy(np.stack(inputs)).to(device)).float().cpu().numpy()
@@ -160,4 +162,4 @@ def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> F
     return np.asarray(depth, np.float32)
 
 
-NETWORK = DepthNetwork("in the package", load_network, depth_of, preset="demo_net", warning=WHAT_IT_IS)
+NETWORK = DepthNetwork("in the package", load_network, depth_of_views, preset="demo_net", warning=WHAT_IT_IS)

@@ -90,11 +90,11 @@ def load_network(weights: str, scene: str, device: str) -> DepthAnythingV2:
 def depths(network: DepthAnythingV2, views: Sequence[View], settings: Reconstruction) -> list[Float32Array]:
     """Depth of each view, HxW float32 m along z, all in one pass.
 
-    Raises ReconstructionError where most of a picture lies at the end of the network's range; else as `depth_of`.
+    Raises ReconstructionError where most of a picture lies at the end of the range; else as `depth_of_images`.
     """
     images = [view.rgb for view in views]
     fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
-    found = depth_of(network, images, fx=fx, dtype=getattr(torch, settings.network_dtype))
+    found = depth_of_images(network, images, fx=fx, dtype=getattr(torch, settings.network_dtype))
     for view, depth, largest_m in zip(views, found, network.max_depth * focal_factors(images, fx), strict=True):
         _check_range(view, depth, float(largest_m))
     return found
@@ -166,7 +166,7 @@ def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return official | {f"depth_head.{key}": value for key, value in vit.renamed(head, _OTHER_NAMES).items()}
 
 
-def depth_of(
+def depth_of_images(
     model: DepthAnythingV2,
     images: Sequence[RGBImage],
     *,
@@ -204,7 +204,7 @@ def depth_of(
     found: dict[int, Float32Array] = {}
     for size in dict.fromkeys(sizes):
         members = [i for i, own in enumerate(sizes) if own == size]
-        depths = _passed(model, [prepared(images[i], size) for i in members], dtype)
+        depths = _passed(model, [resized_input(images[i], size) for i in members], dtype)
         for i, depth in zip(members, depths, strict=True):
             found[i] = scales[i] * _resized_back(depth, images[i].shape[:2])
     return [found[i] for i in range(len(images))]
@@ -236,7 +236,7 @@ def network_size(image: RGBImage) -> Grid:
     return rows, columns
 
 
-def prepared(image: RGBImage, size: Grid) -> Tensor:
+def resized_input(image: RGBImage, size: Grid) -> Tensor:
     """HxWx3 uint8 RGB -> the network's input (3, *size), float32: cubic resize of 0..1 and normalised, in float64."""
     resized = cv2.resize(image / 255.0, size[::-1], interpolation=cv2.INTER_CUBIC)
     normalised = (resized - np.array(MEAN)) / np.array(DEVIATION)

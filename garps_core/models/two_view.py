@@ -163,7 +163,7 @@ class TwoView(nn.Module):
     def encode(self, pictures: Tensor) -> Tensor:
         """Pictures (B, 3, H, W), in -1..1 -> tokens (B, H/16 * W/16, D), row-major. InputError for other sides."""
         encoder = self.architecture.encoder
-        turn = rotation(grid_of(pictures), encoder.width // encoder.heads, pictures.device)
+        turn = rotation(token_grid(pictures), encoder.width // encoder.heads, pictures.device)
         x: Tensor = self.patch_embed(pictures).to(self.mask_token.dtype)  # sums stay exact where autocast is on
         for block in self.enc_blocks:
             x = block(x, turn)
@@ -223,7 +223,7 @@ def attended(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
 
-def grid_of(pictures: Tensor) -> Grid:
+def token_grid(pictures: Tensor) -> Grid:
     """Rows and columns of patches of (B, 3, H, W). Raises InputError unless H and W are multiples of 16."""
     height, width = pictures.shape[-2:]
     if height % PATCH or width % PATCH or not height or not width:

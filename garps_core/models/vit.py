@@ -155,7 +155,7 @@ class VisionTransformer(nn.Module):
         of `taps`, a view of the tokens (channels last in memory). Blocks behind the last tap are not computed.
         Raises InputError for other sides.
         """
-        grid = grid_of(image)
+        grid = patch_grid(image)
         x, found = self.tokens(image), {}
         for index, block in enumerate(self.blocks[: max(taps) + 1]):
             x = block(x)
@@ -167,7 +167,7 @@ class VisionTransformer(nn.Module):
         """What the first block gets: class token and patches with their positions, (B, 1 + rows * columns, D)."""
         patches = self.patch_embed(image).to(self.cls_token.dtype)
         everything = torch.cat((self.cls_token.expand(len(patches), -1, -1), patches), dim=1)
-        return everything + self.positions(grid_of(image))
+        return everything + self.positions(patch_grid(image))
 
     def positions(self, grid: tuple[int, int]) -> Tensor:
         """Position embedding of a grid (rows, columns) of patches, class first: (1, 1 + rows * columns, D)."""
@@ -179,7 +179,7 @@ class VisionTransformer(nn.Module):
         return torch.cat((self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2).to(self.pos_embed.dtype)), dim=1)
 
 
-def grid_of(image: Tensor) -> tuple[int, int]:
+def patch_grid(image: Tensor) -> tuple[int, int]:
     """Rows and columns of patches of (B, 3, H, W). Raises InputError unless H and W are multiples of 14."""
     height, width = image.shape[-2:]
     if height % PATCH or width % PATCH or not height or not width:

@@ -23,7 +23,7 @@ from garps_core.models.deformable import (
     as_maps,
     as_tokens,
     centres,
-    grid_of_map,
+    map_size,
 )
 from garps_core.models.vit import EPSILON, GRID, PATCH, Attention, PatchEmbed
 
@@ -235,7 +235,7 @@ class ViTAdapter(nn.Module):
             raise InputError(f"network input of {height}x{width} pixels: expected multiples of {PATCH} and {COARSEST}")
         patches = (height // PATCH, width // PATCH)
         finest, *coarser = self.spm(picture)
-        grids = [grid_of_map(one) for one in coarser]
+        grids = [map_size(one) for one in coarser]
         pyramid = as_tokens([one + self.level_embed[i][:, None, None] for i, one in enumerate(coarser)])
         tokens = self.tokens(picture, patches)
         share = self.size.blocks // self.size.groups

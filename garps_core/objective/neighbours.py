@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is paired with whom, compiled: what a camera sees, exact nearest neighbours, and what is gathered of them.
+"""Compiled loops of the pairing: visibility, exact nearest neighbours, and the gathering of partners.
 
-Neighbours are found with the partners sorted into cells of the image they came from:
-faster than a k-d tree because a surface seen by a camera is nearly flat in the image: the neighbours of a point lie in
-the cells around its pixel. `pairs.py` falls back on SciPy's tree.
+Neighbours are searched with the partners sorted into cells of the image they came from. That is faster than a k-d tree:
+a surface seen by a camera is nearly flat in the image, so the neighbours of a point lie in the cells around its pixel.
+`compiled.py` calls these loops, and falls back on SciPy's tree.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from garps_core.objective.compiled import Float32, Int64, loop
+from garps_core.objective.loops import Float32, Int64, loop
 
 PER_CELL = 2.0
 """Partners in a cell, on average."""
@@ -25,7 +25,7 @@ def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tu
     """The k nearest partners of each row, exact: indices (n, k) by distance, and distances (n, k).
 
     rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Distances in metres, or in
-    `pairing.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
+    `plain.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
     around a row's pixel are searched until no unseen cell can hold a nearer one: whatever lies beyond a line x = a z
     of the image is at least |x - a z| / sqrt(1 + a^2) away.
     """
@@ -170,8 +170,8 @@ def gathered(
 
 
 @loop
-def seen(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ratio: float) -> npt.NDArray[np.bool_]:
-    """Mask (n,) of points (n, 3) that the other camera sees (`pairing.visible`)."""
+def visible(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32, ratio: float) -> npt.NDArray[np.bool_]:
+    """Mask (n,) of points (n, 3) that the other camera sees (`plain.visible`)."""
     height, width = depth.shape
     mask = np.zeros(len(points), np.bool_)
     reach = np.float32(1 + ratio)

@@ -20,6 +20,7 @@ from garps_core.objective.pairs import DeviceMixture, pair_up, without_floor
 from garps_core.objective.shape import Pairs, evaluate
 from garps_core.objective.state import State, WeightedStart
 from garps_core.solver.ladder import MIN_ROWS, Solution, posterior
+from garps_core.solver.problem import Problem
 
 
 def salient(cloud: DeviceMixture, settings: Alignment) -> DeviceMixture:
@@ -75,13 +76,14 @@ def adam_path(pairs: Pairs, T: Array, settings: Alignment, steps: int) -> list[A
     return path
 
 
-def maximise(source: DeviceMixture, target: DeviceMixture, known: WeightedStart, settings: Alignment) -> list[Solution]:
-    """The paper's optimisation from the known pose; its curvature plus the prior's makes the covariance."""
-    pairs = paper_pairs(source, target, known.T, settings)
+def maximise(problem: Problem) -> list[Solution]:
+    """The paper's optimisation from the start; its curvature plus the start's precision makes the covariance."""
+    start, settings = problem.start, problem.settings
+    pairs = paper_pairs(problem.source, problem.target, start.T, settings)
     if pairs is None:
         return []
     rung = settings.ladder[0]
-    at = State(adam_path(pairs, known.T, settings, rung.steps)[-1])
+    at = State(adam_path(pairs, start.T, settings, rung.steps)[-1])
     weight = settings.effective_measurements * rung.covariance_scale
-    end = posterior(evaluate(pairs, at.T, "sum"), at, WeightedStart(known.T, known.precision), weight)
-    return [Solution(at, end, rung.steps, True, weight, end.data)]
+    end = posterior(evaluate(pairs, at.T, "sum"), at, WeightedStart(start.T, start.precision), weight)
+    return [Solution(at, end, rung.steps, True, weight, end.data, fixed_steps=True)]

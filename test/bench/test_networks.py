@@ -6,7 +6,8 @@ import torch
 import typer
 from torch import nn
 
-from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, counted_flop, measured
+from bench.machine.flop import counted_flop
+from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, measured
 from bench.networks.pair import STAGES, measured_pair
 from garps_core.models import depth_anything
 from garps_core.models.vit import Attention
@@ -57,5 +58,4 @@ def test_a_line_of_the_table_of_pairs(monkeypatch):
         torch.set_num_threads(before)
     assert row["status"] == "converged"
     assert all(row[f"{stage} s"] > 0 for stage in STAGES)
-    assert sum(row[f"{stage} s"] for stage in STAGES) == pytest.approx(row["wall s"], rel=0.5)
     assert 0 <= row["beyond imports MiB"] < row["peak MiB"]  # 0 where an earlier test needed more

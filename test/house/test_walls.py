@@ -88,7 +88,7 @@ def test_the_core_knows_no_ros_and_none_of_its_users(path: Path) -> None:
     allowed = STDLIB | {"garps_core", "numpy", "scipy", "cv2", "torch", "poselib", "typer", "rich"}
     if path.name == "figure.py":
         allowed = allowed | {"matplotlib"}
-    if path.name == "compiled.py":
+    if path.name == "loops.py":
         allowed = allowed | {"numba"}
     if path == ROOT / "garps_core/config/text.py":
         allowed = allowed | {"ruamel"}

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from garps_core.errors import ConfigError, InputError, ModelError
 from garps_core.models.check import check_file
-from garps_core.models.mast3r import KEPT, NaverModel, prepared, prepared_square
+from garps_core.models.mast3r import KEPT, NaverModel, cropped_input, square_input
 from garps_core.models.two_view import Architecture, Stack, TwoView, built_from
 from garps_core.point_maps import PairMaps, PointMap, TwoViewModel
 
@@ -72,7 +72,7 @@ def test_pictures_are_resized_and_cut_as_published(size, expected) -> None:
     rgb = image(*size)
     method = pillow.Resampling.LANCZOS if max(size) > 512 else pillow.Resampling.BICUBIC
     cut = pillow.fromarray(rgb).resize(resized[::-1], method).crop((left, top, left + columns, top + rows))
-    seen, framing = prepared(rgb)
+    seen, framing = cropped_input(rgb)
     assert framing.size == seen.shape[1:] == (rows, columns)
     assert framing.offset == (left, top)
     assert framing.scale == (resized[1] / size[1], resized[0] / size[0])
@@ -95,7 +95,7 @@ def test_the_variant_of_squares_sees_the_middle(size, expected) -> None:
     rgb = image(*size)
     method = pillow.Resampling.LANCZOS if max(size) > max(resized) else pillow.Resampling.BICUBIC
     cut = pillow.fromarray(rgb).resize(resized[::-1], method).crop((left, top, left + 224, top + 224))
-    seen, framing = prepared_square(rgb, 224)
+    seen, framing = square_input(rgb, 224)
     assert (framing.size, framing.offset) == ((224, 224), (left, top))
     assert framing.scale == (resized[1] / size[1], resized[0] / size[0])
     np.testing.assert_array_equal(seen, chw(np.asarray(cut), (0.5,) * 3, (0.5,) * 3)[0])
@@ -105,7 +105,7 @@ def test_the_framing_says_where_a_pixel_went() -> None:
     """A bright spot of a picture is found where the framing says, for both axes and a cut."""
     rgb = np.zeros((500, 750, 3), np.uint8)
     rgb[100:104, 600:604] = 255
-    seen, framing = prepared(rgb)
+    seen, framing = cropped_input(rgb)
     y, x = np.mgrid[: seen.shape[1], : seen.shape[2]]
     weight = (seen[0].numpy() + 1).clip(0)
     centre = np.array([[(weight * x).sum(), (weight * y).sum()]]) / weight.sum()
@@ -151,7 +151,7 @@ def largest_difference(one: PairMaps, other: PairMaps) -> float:
 
 def one_by_one(network: TwoView, source, target) -> PairMaps:
     """The plain way: each order alone, each picture encoded anew."""
-    seen, framings = zip(*(prepared(picture, SIDE) for picture in (source, target)), strict=True)
+    seen, framings = zip(*(cropped_input(picture, SIDE) for picture in (source, target)), strict=True)
     grids = [(framing.size[0] // 16, framing.size[1] // 16) for framing in framings]
     orders = []
     for i, j in ((0, 1), (1, 0)):

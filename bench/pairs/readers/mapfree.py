@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.datasets import Pair
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair
+from bench.pairs.readers.dataset_files import (
     Candidate,
     floats,
     gathered,

@@ -17,8 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from bench.pairs.datasets import Pair
-from bench.pairs.readers.files import Candidate, category_of, gathered, image, inside, pair_of, require, text_of, view
+from bench.pairs.pair import Pair
+from bench.pairs.readers.dataset_files import (
+    Candidate,
+    category_of,
+    gathered,
+    image,
+    inside,
+    pair_of,
+    require,
+    text_of,
+    view,
+)
 from garps_core.checks import Float64Array, checked_intrinsics, checked_rigid
 from garps_core.types import View
 

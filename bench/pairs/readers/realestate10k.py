@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, rng_of
+from bench.pairs.pair import Pair, rng_of
 from bench.pairs.readers import pair_list
-from bench.pairs.readers.files import (
+from bench.pairs.readers.dataset_files import (
     MissingFiles,
     category_of,
     depth_map,

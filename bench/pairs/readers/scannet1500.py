@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.pairs.datasets import Pair
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair
+from bench.pairs.readers.dataset_files import (
     Candidate,
     Rgb,
     arrays,

@@ -17,8 +17,8 @@ import functools
 import re
 from pathlib import Path
 
-from bench.pairs.datasets import Pair, rng_of
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair, rng_of
+from bench.pairs.readers.dataset_files import (
     Candidate,
     chosen,
     depth_map,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.readers.files import arrays, floats, rows
+from bench.pairs.readers.dataset_files import arrays, floats, rows
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.geometry import project
 

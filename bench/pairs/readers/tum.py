@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, rng_of
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair, rng_of
+from bench.pairs.readers.dataset_files import (
     Candidate,
     chosen,
     depth_map,

@@ -11,12 +11,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import INLINE
 from surfaces import moved, permuted, random_mixture, random_pose
 
 from garps_core import Config
 from garps_core.config import Alignment, Rung
 from garps_core.geometry import adjoint, se3_exp, se3_inverse
-from garps_core.objective import shape
 from garps_core.objective.pairs import pair_up, to_device, without_floor
 from garps_core.objective.shape import evaluate
 from garps_core.objective.state import State
@@ -234,7 +234,7 @@ def assert_same(a, b, tolerance):
 def test_size_of_the_chunks_does_not_matter(form, chunk, monkeypatch):
     pairs = all_pairs(k=9, form=form)
     plain = evaluate(pairs, POSE, form)
-    monkeypatch.setattr(shape, "CHUNK_PAIRS", chunk)
+    monkeypatch.setattr("garps_core.objective.plain.CHUNK_PAIRS", chunk)
     assert_same(evaluate(pairs, POSE, form), plain, 1e-10)
 
 
@@ -258,7 +258,7 @@ def test_moving_both_frames_moves_the_pose(form, seed):
 def test_swapping_the_views_inverts_the_pose():
     back = se3_inverse(POSE)
     forward, backward = all_pairs(k=9), all_pairs(PARTNERS, ROWS, back, k=9)
-    e, swapped = two_way(forward, backward, State(POSE)), two_way(backward, forward, State(back))
+    e, swapped = two_way(forward, backward, State(POSE), INLINE), two_way(backward, forward, State(back), INLINE)
     A = -adjoint(back)  # the left twist of T^-1 that a left twist of T makes
     assert swapped.value == pytest.approx(e.value, rel=1e-12)
     np.testing.assert_allclose(A.T @ swapped.gradient, e.gradient, atol=1e-12 * np.abs(e.gradient).max())
@@ -271,10 +271,10 @@ def test_gradient_of_both_directions_is_that_of_central_differences():
     forward, backward = all_pairs(k=9), all_pairs(PARTNERS, ROWS, se3_inverse(POSE), k=9)
 
     def value(twist):
-        return two_way(forward, backward, State(se3_exp(twist) @ POSE)).value
+        return two_way(forward, backward, State(se3_exp(twist) @ POSE), INLINE).value
 
     numeric = [(value(1e-5 * e) - value(-1e-5 * e)) / 2e-5 for e in np.eye(6)]
-    gradient = two_way(forward, backward, State(POSE)).gradient
+    gradient = two_way(forward, backward, State(POSE), INLINE).gradient
     np.testing.assert_allclose(gradient, numeric, atol=1e-6 * np.abs(gradient).max())
 
 

@@ -4,7 +4,7 @@
 `method(source, target, T_start) -> Result`: two RGB-D views and a 4x4 start pose (or None) to a 4x4 pose or the reason
 why there is none. A method never raises on data. Every call starts from the images, so its wall time is honest. Those
 that work on clouds share one kind of clouds, those that work on matches the same matches; COLMAP makes its own. Each
-peer got the settings that served it best on the pairs of `bench.pairs.datasets`, but `colmap` and `cpd`, which have the
+peer got the settings that served it best on the recorded RGB-D pairs, but `colmap` and `cpd`, which have the
 usual ones.
 """
 

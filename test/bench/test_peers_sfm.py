@@ -14,12 +14,13 @@ from installed_peers import ON_THE_WALL, method
 from network_weights import install_reduced
 from point_map_cases import point_maps
 
-from bench.pairs.datasets import Pair, disturbed, rng_of, scene_points
+from bench.pairs.pair import Pair, rng_of, scene_points
+from bench.pairs.starts import disturbed
 from bench.peers import metres
-from bench.peers.baselines import METHODS, NEED_NO_START, NONDETERMINISTIC
 from bench.peers.colmap import colmap_relaxed
 from bench.peers.features_pnp import Failure, features_pnp_oneway
 from bench.peers.five_point import five_point
+from bench.peers.methods import METHODS, NEED_NO_START, NONDETERMINISTIC
 from bench.rooms import make_pair
 from garps_core import View, metrics
 from garps_core.geometry import transform

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bench.pairs.datasets import Pair, scene_points, spread
+from bench.pairs.pair import Pair, scene_points, spread
 from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.geometry import so3_log
 from garps_core.types import View

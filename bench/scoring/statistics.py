@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the errors of a method are summed up to: its own successes, all pairs, or the pairs that every method solved.
 
-Rows are those of `bench.rows.evaluate`, one per depth, set, start, pair and method. A mean or a spread exists over
+Rows are those of `bench.rows.pair_rows`, one per depth, set, start, pair and method. A mean or a spread exists over
 poses only, and flatters methods that fail on hard pairs; a median and an AUC exist over all pairs with failures at
 infinity; over the common subset methods may be compared by their means. Each comes with its n. Pairs for which the
 truth defines no such error (E_3D without points, the direction of no motion) are left out, for every method alike.
@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.rows.row import Row
 from bench.scoring.scores import NAN, auc, mean_average_accuracy, pose_error_deg
-from bench.scoring.tables import Row, error_of
+from bench.scoring.summary import error_of
 from garps_core.checks import Float64Array
 
 DDOF = 1
