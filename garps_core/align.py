@@ -21,10 +21,9 @@ from garps_core.mixtures.reconstruct import depth_origin, mixtures_of, with_dept
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import DeviceMixture, overlap, to_device
 from garps_core.objective.state import WeightedStart
-from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
+from garps_core.solver.methods import METHODS
 from garps_core.solver.problem import Problem
-from garps_core.solver.search import search
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.verdict.candidate import Candidate, best_candidate
@@ -186,9 +185,8 @@ def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -
     settings = config.alignment
     known = _known(initial, config)
     guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
-    maximise = paper.maximise if settings.solver == "adam" else search if guess else ladder.anneal
     with ThreadPoolExecutor(1) as pool:
-        solutions = maximise(Problem(x, y, known, config, pool, guess))
+        solutions = METHODS[config.method](Problem(x, y, known, config, pool, guess))
         best = best_candidate((_candidate(end, x, y, known, guess, config) for end in solutions), settings)
     if best is None:
         shared = overlap(x, y, known.T, settings)
@@ -222,7 +220,7 @@ def _known(initial: Prior, config: Config) -> WeightedStart:
     """The initial pose as a measurement, and where they are solved for, what depth maps usually get wrong."""
     precision = np.linalg.inv(twist_from_ros(initial.covariance, initial.T_target_source))
     of_errors = np.zeros(0)
-    if config.alignment.depth_errors and config.alignment.solver != "adam":
+    if config.solves_depth_errors:
         of_errors = np.tile(1 / np.maximum(error_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
     return WeightedStart(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
 

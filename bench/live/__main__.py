@@ -35,7 +35,8 @@ from bench.rooms import RoomPair, make_pair
 from msg_adapters import ns_to_stamp, stamp_to_ns
 
 ROOM_SEED, ROOM_LEVEL = 3, 2
-SLOW = ["lifting.stride:=1", "alignment.solver:=adam"]
+EVERY = ["paper.opacity_threshold:=0.0", "paper.component_stride:=1"]
+SLOW = ["lifting.stride:=1", "method:=paper", "paper.steps:=8", "paper.neighbours:=20", *EVERY]
 """Settings under which a pair of 640x480 takes 1.5 s and more on two cores; nobody would want them."""
 CHEAP = ["lifting.stride:=8", "start.max_features:=300"]
 WARM_UP = 3

@@ -4,6 +4,7 @@
 from garps_core.config.alignment import Alignment, Rung
 from garps_core.config.config import PRESETS, Config, preset_for
 from garps_core.config.lifting import Lifting
+from garps_core.config.paper import Paper
 from garps_core.config.reconstruction import DEPTH_NETWORKS, METHODS, SCENES, Reconstruction
 from garps_core.config.start import STARTS, TWO_VIEW, Start
 
@@ -17,6 +18,7 @@ __all__ = [
     "Alignment",
     "Config",
     "Lifting",
+    "Paper",
     "Reconstruction",
     "Rung",
     "Start",

@@ -32,11 +32,6 @@ class Rung(Checked):
 class Alignment(Checked):
     """The objective and how it is maximised (`align_mixtures`)."""
 
-    solver: str = setting(
-        "second_order",
-        "second_order = annealed maximum a posteriori; adam = the paper's method",
-        choices=("second_order", "adam"),
-    )
     ladder: tuple[Rung, ...] = (
         Rung(1000.0, 800, 20, 8),
         Rung(300.0, 1000, 20, 8),
@@ -122,10 +117,6 @@ class Alignment(Checked):
         low=1e-6,
         high=1e6,
     )
-    component_stride: int = setting(1, "paper's solver: use every n-th component", low=1, high=100_000)
-    opacity_threshold: float = setting(0.0, "drop components of smaller weight", low=0, high=1)
-    adam_rate_translation: float = setting(9e-5, "Adam's rate for the translation", unit="m", low=0, high=1)
-    adam_rate_rotation: float = setting(3e-6, "Adam's rate for the quaternion", unit="", low=0, high=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,6 +13,7 @@ from typing import Any
 from garps_core.config.alignment import Alignment, Rung
 from garps_core.config.field import Checked, flattened, replaced, setting
 from garps_core.config.lifting import Lifting
+from garps_core.config.paper import Paper
 from garps_core.config.reconstruction import Reconstruction
 from garps_core.config.start import Start
 from garps_core.errors import ConfigError
@@ -26,6 +27,12 @@ class Config(Checked):
     lifting: Lifting = Lifting()
     start: Start = Start()
     alignment: Alignment = Alignment()
+    paper: Paper = Paper()
+    method: str = setting(
+        "garps",
+        "garps = annealed maximum a posteriori alignment; paper = the published objective and optimiser",
+        choices=("garps", "paper"),
+    )
     device: str = setting("cpu", "where the objective runs: cpu, cuda, cuda:0 ...")
     dtype: str = setting("float32", "arithmetic of the objective", choices=("float32", "float64"))
     seed: int = setting(0, "seed of the robust estimators", low=0, high=2**31 - 1)
@@ -36,6 +43,16 @@ class Config(Checked):
         if name not in PRESETS:
             raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(PRESETS)}")
         return PRESETS[name]()
+
+    @property
+    def solves_depth_errors(self) -> bool:
+        """Whether the errors of each depth map are unknowns beside the pose; the published method has none."""
+        return self.alignment.depth_errors and self.method == "garps"
+
+    @property
+    def published_order(self) -> bool:
+        """Whether components keep their network's order, of which the published method takes every n-th."""
+        return self.method == "paper"
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
         """A copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Raises ConfigError on a typo."""
@@ -88,17 +105,7 @@ def _monocular() -> Config:
 
 def _paper() -> Config:
     """Li and Campbell, GARPS: the published objective, hyperparameters and optimiser."""
-    return Config(
-        lifting=Lifting(weighting="equal"),
-        alignment=Alignment(
-            solver="adam",
-            ladder=(Rung(90.0, 1_000_000, 30, 1000),),
-            colour_variance=0.4,
-            component_stride=32,
-            opacity_threshold=0.5,
-            max_prior_sigmas=1e6,
-        ),
-    )
+    return Config(lifting=Lifting(weighting="equal"), method="paper")
 
 
 def _paper_full() -> Config:

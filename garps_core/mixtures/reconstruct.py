@@ -133,8 +133,7 @@ def mixture_of(view: View, config: Config) -> Mixture:
     gaussians = predict_gaussians(
         in_use.flash3d(settings.flash3d_weights, config.device), view, settings.drop_border, in_use.dtype_of(config)
     )
-    published = config.alignment.solver == "adam"
-    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not published)
+    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not config.published_order)
 
 
 def mixtures_of(views: Sequence[View], config: Config) -> list[Mixture]:

@@ -22,7 +22,7 @@ NODES = {
     "busy_term": (signal.SIGTERM, True),
 }
 CHEAP = ["-p", "lifting.stride:=4"]
-COSTLY = ["-p", "preset:=paper", "-p", "lifting.stride:=1", "-p", "alignment.component_stride:=1"]
+COSTLY = ["-p", "preset:=paper", "-p", "lifting.stride:=1", "-p", "paper.component_stride:=1"]
 """A thousand steps over all components, a minute: still under way when the second signal comes, on any machine."""
 
 

@@ -117,7 +117,8 @@ def test_values_reach_the_settings() -> None:
     node, config = settings_from(values_of("paper", sync_slop=0.5, lifting__stride=7, device="cuda:0"))
     assert node.sync_slop == 0.5 and node.preset == "paper"
     assert config == Config.preset("paper").replace({"lifting.stride": 7, "device": "cuda:0"})
-    assert config.alignment.ladder == Config.preset("paper").alignment.ladder != Config().alignment.ladder
+    monocular = settings_from(values_of("monocular"))[1]
+    assert monocular.alignment.ladder == Config.preset("monocular").alignment.ladder != Config().alignment.ladder
 
 
 WRONG = {

@@ -252,7 +252,7 @@ def test_a_changed_line_of_the_file_counts(tmp_path: Path) -> None:
     with ros_node("--params-file", str(file)) as node:
         found = Live(node).parameters
     assert found.config.lifting.stride == 9 and found.node.sync_slop == 0.5
-    assert found.config.alignment.adam_rate_translation == 1e-7
+    assert found.config.paper.rate_translation == 1e-7
 
 
 def test_nested_names_are_the_same_as_dotted_ones(tmp_path: Path) -> None:
