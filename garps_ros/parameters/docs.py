@@ -25,6 +25,7 @@ GROUPS = {
     "lifting": ("`lifting`", "How a pixel with depth becomes a Gaussian: the sensor model."),
     "start": ("`start`", "Where the alignment starts."),
     "alignment": ("`alignment`", "The objective and how it is maximised; what a pose must hold to be published."),
+    "paper": ("`paper`", "The published method, used where `method` is paper."),
     "": ("The estimator as a whole", "Where and in which arithmetic it runs."),
 }
 OTHER_PRESETS = tuple(name for name in PRESETS if name not in ("default", "sensor"))
