@@ -27,7 +27,7 @@ from garps_core.solver.problem import Problem
 from garps_core.start.initialise import identity, initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 from garps_core.verdict.candidate import Candidate, best_candidate
-from garps_core.verdict.covariance import inflated, pose_covariance, share_of_known
+from garps_core.verdict.covariance import inflated, pose_covariance, share_of_start
 from garps_core.verdict.status import quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0
@@ -245,7 +245,7 @@ def _candidate(
     if seen is not None and settings.brightness_measurements > 0:
         T, covariance, kept = seen.T, ros_from_twist(seen.covariance, seen.T), seen.kept
     if config.lifting.sigma_inflation > 1:
-        of_known = ros_from_twist(kept @ share_of_known(solution, known) @ kept.T, T)
+        of_known = ros_from_twist(kept @ share_of_start(solution, known) @ kept.T, T)
         covariance = inflated(covariance, of_known, config.lifting.sigma_inflation)
     common = config.lifting.common_scale_sigma
     if config.reconstruction.method == "two_view":

@@ -33,7 +33,7 @@ def verdict(
     Args:
         candidate: the pose to judge.
         start: the pose from which it was found, with its covariance.
-        guess: the start says next to nothing, so the pose needs more evidence.
+        guess: the start carries next to no information, so the pose needs more evidence.
         uncertainty: `relative_uncertainty` of the candidate.
         settings: thresholds.
     """

@@ -208,8 +208,8 @@ def test_the_page_has_a_row_for_every_parameter() -> None:
         "| `lifting.noise_linear` | double | `0.003`; time_of_flight `0.001`; structured_light `0.0`; stereo `0.0`;"
     )
     assert row.startswith(expected)
-    (row,) = [row for row in rows if "`alignment.max_prior_sigmas`" in row]
-    assert "`8.0`; paper `1000000.0`" in row
+    (row,) = [row for row in rows if "`alignment.effective_measurements`" in row]
+    assert "`30.0`; monocular `5.0`" in row
 
 
 @pytest.mark.parametrize(
