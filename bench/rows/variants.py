@@ -67,9 +67,10 @@ def last_rung(config: Config) -> Config:
 
 
 def as_published(config: Config) -> Config:
-    """The paper's own settings for lifting and alignment."""
-    paper = Config.preset("paper")
-    return replace(config, lifting=paper.lifting, alignment=paper.alignment)
+    """The paper's method with its own settings for lifting and alignment."""
+    published = Config.preset("paper")
+    parts = {name: getattr(published, name) for name in ("method", "lifting", "alignment", "paper")}
+    return replace(config, **parts)
 
 
 VARIANTS: dict[str, Variant] = {

@@ -21,7 +21,7 @@ def check_settings(config: Config) -> None:
         )
     if config.reconstruction.method == "two_view" and config.start.method == "dust3r":
         raise ConfigError("reconstruction.method is two_view and the points of dust3r have no metres: expected mast3r")
-    if config.alignment.depth_errors or config.alignment.solver == "adam":
+    if config.alignment.depth_errors or config.method == "paper":
         return
     if config.reconstruction.method == "auto":
         raise MissingDepthError(

@@ -12,8 +12,9 @@ from typing import Any
 
 from garps_core.config.alignment import Alignment
 from garps_core.config.field import Checked, flattened, replaced, setting
-from garps_core.config.ladders import NETWORK, NETWORK_SEARCH, PAPER
+from garps_core.config.ladders import NETWORK, NETWORK_SEARCH
 from garps_core.config.lifting import Lifting
+from garps_core.config.paper import Paper
 from garps_core.config.reconstruction import Reconstruction
 from garps_core.config.renamed import current
 from garps_core.config.start import Start
@@ -28,6 +29,13 @@ class Config(Checked):
     lifting: Lifting = Lifting()
     start: Start = Start()
     alignment: Alignment = Alignment()
+    paper: Paper = Paper()
+    method: str = setting(
+        "garps",
+        "method of alignment: garps = annealed maximum a posteriori; paper = the published objective and optimiser",
+        choices=("garps", "paper"),
+        expert=True,
+    )
     device: str = setting("cpu", "device of the objective and of the networks: cpu, cuda, cuda:0 ...")
     dtype: str = setting("float32", "arithmetic of the objective", choices=("float32", "float64"), expert=True)
     seed: int = setting(0, "seed of the random numbers of robust estimators", low=0, high=2**31 - 1, expert=True)
@@ -38,6 +46,16 @@ class Config(Checked):
         if name not in PRESETS:
             raise ConfigError(f"preset {name!r} does not exist: expected one of {', '.join(PRESETS)}")
         return PRESETS[name]()
+
+    @property
+    def solves_depth_errors(self) -> bool:
+        """Whether the errors of each depth map are unknowns beside the pose; the published method has none."""
+        return self.alignment.depth_errors and self.method == "garps"
+
+    @property
+    def published_order(self) -> bool:
+        """Whether components keep their network's order, of which the published method takes every n-th."""
+        return self.method == "paper"
 
     def replace(self, changes: Mapping[str, Any]) -> Config:
         """Return a copy with settings changed by dotted name, e.g. {"lifting.stride": 4}. Names of old work too.
@@ -94,17 +112,7 @@ def _monocular() -> Config:
 
 def _paper() -> Config:
     """Li and Campbell, GARPS: the published objective, hyperparameters and optimiser."""
-    return Config(
-        lifting=Lifting(weighting="equal"),
-        alignment=Alignment(
-            solver="adam",
-            ladder=PAPER,
-            colour_variance=0.4,
-            component_stride=32,
-            opacity_threshold=0.5,
-            max_prior_sigmas=1e6,
-        ),
-    )
+    return Config(lifting=Lifting(weighting="equal"), method="paper")
 
 
 def _paper_full() -> Config:

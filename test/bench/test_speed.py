@@ -96,7 +96,7 @@ def test_the_papers_solver_gets_the_same_components_and_its_own_number_of_pairs(
     held = contest(inputs)
     x, y = held.mixtures["second order"][0], held.mixtures["paper"][0]
     assert x.means is y.means and x.covariances is y.covariances and np.ptp(y.weights) == 0 < np.ptp(x.weights)
-    assert held.configs["paper"].alignment == Config.preset("paper").alignment
+    assert held.configs["paper"].paper == Config.preset("paper").paper
     assert len(held.paper_pairs().means) == -(-len(x) // 32)
     assert any(f"{len(held.paper_pairs().means)} rows" in note for note in section.notes)
     assert all(check.at_least for check in section.checks) and len(section.checks) == 5
