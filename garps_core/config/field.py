@@ -103,7 +103,7 @@ def replaced(part: Any, name: str, path: list[str], value: Any, whole: Any = Non
     names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
     if path[0] not in names:
         near = difflib.get_close_matches(name, [known for known, _ in flattened("", whole)], n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else "docs/parameters.md lists all names"
+        hint = f"did you mean {near[0]!r}?" if near else "expected a name of docs/parameters.md"
         raise ConfigError(f"setting {name!r} does not exist; {hint}")
     if len(path) > 1:
         value = replaced(getattr(part, path[0]), name, path[1:], value, whole)
