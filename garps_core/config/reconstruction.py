@@ -35,7 +35,7 @@ class Reconstruction(Checked):
     )
     scene: str = setting(
         "any",
-        "kind of scene that the depth network's weights must be made for; a file that names none is taken for this kind",
+        "kind of scene that the depth network's weights must be made for; a file that names none counts as this",
         choices=SCENES,
         live=False,
     )

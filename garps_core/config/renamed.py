@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings that had another name, or words of theirs that did, in the release before: they work on, with a warning."""
+"""Old names of settings, and old words for their values; they work for one release, with a warning."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RENAMED = (
     Renamed("alignment.information", "alignment.effective_measurements"),
     Renamed("alignment.brightness", "alignment.brightness_measurements"),
 )
-"""One line for each, kept for one release."""
+"""Table of old names, one line each; a line is deleted after one release."""
 
 
 def current(name: str, value: Any) -> tuple[str, Any]:
