@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings: every one has a default, a range, a unit and a meaning. `config.py` holds `Config` and the presets."""
+"""Settings with default, range, unit and meaning. `config.py` holds `Config` and the presets."""
 
 from garps_core.config.alignment import Alignment
 from garps_core.config.config import PRESETS, Config

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings that had another name, or words of theirs that did, in the release before: they work on, with a warning."""
+"""Old names of settings, and old words for their values; they work for one release, with a warning."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RENAMED = (
     Renamed("alignment.adam_rate_translation", "paper.rate_translation"),
     Renamed("alignment.adam_rate_rotation", "paper.rate_rotation"),
 )
-"""One line for each, kept for one release."""
+"""Table of old names, one line each; a line is deleted after one release."""
 
 
 def current(name: str, value: Any) -> tuple[str, Any]:

@@ -167,8 +167,14 @@ SETTINGS = {
         lambda: Config().replace({"lifting.strid": 4}),
         "'lifting.strid' does not exist; did you mean 'lifting",
     ),
-    "no part": (lambda: Config().replace({"information": 4}), "did you mean 'alignment.effective_measurements'"),
-    "nothing like it": (lambda: Config().replace({"zzzzzz": 4}), "'zzzzzz' does not exist; expected one of the names"),
+    "no part": (
+        lambda: Config().replace({"effective_measurements": 4}),
+        "did you mean 'alignment.effective_measurements'",
+    ),
+    "nothing like it": (
+        lambda: Config().replace({"zzzzzz": 4}),
+        "'zzzzzz' does not exist; expected a name of docs/param",
+    ),
     "below a leaf": (lambda: Config().replace({"seed.value": 4}), "setting 'seed.value' does not exist"),
     "below range": (
         lambda: Config().replace({"lifting.stride": 0}),
