@@ -43,13 +43,6 @@ class Alignment(Checked):
         high=10,
         expert=True,
     )
-    depth_weight: float = setting(
-        1.0,
-        "factor on log depth when partners are the nearest in the image; 1 = they are the nearest in space",
-        low=1e-3,
-        high=1,
-        expert=True,
-    )
     max_distance_m: float = setting(
         2.5, "largest distance between a component and its partner", unit="m", low=1e-3, high=1000, expert=True
     )
