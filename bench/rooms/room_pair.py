@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from bench.rooms.depth import monocular_depth, sensor_depth
 from bench.rooms.layout import make_room
 from bench.rooms.mesh import LABELS, Array
-from bench.rooms.render import Float32Array, Room
+from bench.rooms.render import Room
+from bench.rooms.scene import Float32Array
 from bench.rooms.shading import camera_rays
 from garps_core.geometry import se3_inverse
 

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
+from garps_core.edges import away_from_edges
 from garps_core.errors import MissingDepthError, ReconstructionError
-from garps_core.mixtures.edges import away_from_edges
 from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.types import Mixture, View
 

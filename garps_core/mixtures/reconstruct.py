@@ -2,7 +2,7 @@
 """View -> Mixture: from the sensor's depth, from a depth network's, or by Flash3D on either.
 
     view -> with_depth: the sensor's, a depth network's of all views in one pass, or that of the two-view network which
-            also gives the initial pose
+            also gives the start pose
          -> mixture_of: lifted pixel by pixel, or two Gaussians per pixel by Flash3D; labels where asked for
 
 `config.reconstruction.method` chooses. Every function takes the `Networks` that it asks; without any it loads its own

@@ -2,8 +2,8 @@
 """The demonstration depth network, trained on generated rooms alone and shipped with the package: one image and its
 intrinsics -> depth in metres.
 
-It makes the way from two plain images to a pose run without any download, with errors that are a network's own. Of real
-pictures it knows nothing: docs/demo_net.md has its errors. Nothing chooses it but who asks for it by name.
+With it two plain images give a pose without any download. It knows nothing of real pictures: docs/demo_net.md has its
+errors. It is used only where it is asked for by name.
 
 A picture of any size is brought to 192x256 pixels. Beside its colours the network gets the slopes x/z and y/z of every
 pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell. Trained by
@@ -34,18 +34,18 @@ from garps_core.weights.state_dict import load_strictly
 HEIGHT, WIDTH = 192, 256
 """Pixels of the network's input; its answer has half as many a side."""
 CHANNELS = (24, 32, 64, 96, 128)
-"""Of the maps at 1/2, 1/4 ... 1/32 of the input."""
+"""Channels of the maps at 1/2, 1/4 ... 1/32 of the input."""
 BLOCKS = (0, 2, 2, 2, 1)
-"""Residual blocks at each of them."""
+"""Residual blocks of each of these maps."""
 MEAN, DEVIATION = 0.45, 0.25
-"""Of the colours, 0..1."""
+"""Mean and deviation of the colours, 0..1."""
 UNIT_FOCAL_PX = 220.0
 """A focal length that counts as 1, in pixels of the input."""
 WHAT_IT_IS = "a demonstration: it knows generated rooms only, its depth of real pictures means little"
 FILE = "demo_net.safetensors"
 MAX_BYTES = 6_000_000
 MAX_ASPECT = 3
-"""Of a picture's sides: beyond, nothing like it was ever seen in training."""
+"""Largest ratio of a picture's sides; training had none beyond."""
 
 
 class Unit(nn.Sequential):

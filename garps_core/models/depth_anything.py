@@ -2,8 +2,8 @@
 """Depth Anything V2 (Yang et al. 2024), the metric models: one image -> depth along the optical axis, in metres.
 
 A DINOv2 transformer, a dense prediction head, a sigmoid and the largest depth of the training: 20 m (indoor) or 80 m
-(outdoor). The weights do not tell which, nor whether they are a relative model's: the caller says so. The calibration
-does not enter the network, its scale assumes the cameras of the training.
+(outdoor). The weights do not tell which, nor whether they are a relative model's: the caller must know. The calibration
+does not enter the network; its scale assumes the cameras of the training.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SHORT_SIDE = 518
 """Pixels of the shorter side of the network's input."""
 LONGEST_SIDE = 8 * SHORT_SIDE
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of red, green and blue (0..1) in the training images."""
+"""Mean and deviation of red, green and blue (0..1) in the training images."""
 TRAINING_FX = 0.5 / np.tan(np.radians(60) / 2)
 """Focal length over image width of the indoor training's cameras: 60 deg wide."""
 DTYPES = {torch.float32, torch.float16, torch.bfloat16}
@@ -157,7 +157,7 @@ _OTHER_NAMES = (
 def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of an `-hf` file, as the `transformers` library names them -> the same under the official names.
 
-    Raises WeightsError for a name that is not known, or an attention that is not whole.
+    Raises WeightsError for an unexpected name, or an incomplete attention layer.
     """
     prefix = "backbone."
     backbone = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

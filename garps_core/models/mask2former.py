@@ -38,7 +38,7 @@ from garps_core.models.vit_adapter import COARSEST, AdapterSize, ViTAdapter, ada
 from garps_core.weights.state_dict import load_strictly
 
 GROUPS = 32
-"""Of every group normalisation."""
+"""Groups of every group normalisation."""
 LEVELS = 3
 """Maps that deformable attention and the queries look at."""
 SIDE = math.lcm(PATCH, COARSEST)
@@ -78,7 +78,7 @@ def head_size(tensors: Mapping[str, Tensor]) -> HeadSize:
 
 
 class FeedForward(nn.Module):
-    """What two layers with ReLU between add to the tokens."""
+    """Two layers with ReLU between, added to the tokens."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -158,7 +158,7 @@ class PixelDecoder(nn.Module):
 
 
 class PlainAttention(nn.Module):
-    """What queries (B, Q, D) find among keys and values (B, N, D); not where `blocked` (B * heads, Q, N) is True."""
+    """Attention of queries (B, Q, D) to keys and values (B, N, D), except where `blocked` (B * heads, Q, N)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

@@ -49,7 +49,7 @@ def cropped_input(rgb: Picture, long_side: int = LONG_SIDE) -> tuple[Tensor, Fra
 
 
 def square_input(rgb: Picture, side: int) -> tuple[Tensor, Framing]:
-    """The same for a network that sees the middle square, side x side pixels."""
+    """The input of a network that sees the middle square, side x side pixels."""
     height, width = rgb.shape[:2]
     resized = _resized(rgb, round(side * max(height, width) / max(min(height, width), 1)))
     return _cut(rgb, resized, (side, side))
@@ -135,7 +135,7 @@ class NaverModel:
         return next(self.network.parameters()).device
 
     def _encoded(self, pictures: Sequence[Picture]) -> list[_Encoded]:
-        """Both pictures, those that are not kept from before by the network."""
+        """Encode both pictures; the network runs on those that are not kept from before."""
         keys = [(digest(picture), self._device) for picture in pictures]
         new = {key: self._input(rgb) for key, rgb in zip(keys, pictures, strict=True) if key not in self._kept}
         inputs = [seen for seen, _ in new.values()]
@@ -158,7 +158,7 @@ class NaverModel:
         return [tokens[i : i + 1] for i in range(len(tokens))]
 
     def _decode(self, orders: list[tuple[_Encoded, _Encoded]]) -> list[tuple[PointMap, PointMap]]:
-        """Both views of each order; the first views are of one size, and the second ones."""
+        """Decode both views of each order; the first views have one size, the second ones too."""
         first, second = (torch.cat([order[i].tokens for order in orders]) for i in (0, 1))
         seen = self.network.decode(first, orders[0][0].grid, second, orders[0][1].grid)
         one, two = (self._point_maps(maps) for maps in seen)

@@ -33,7 +33,7 @@ from garps_core.weights.store import installed
 RATIOS = (1.0, 1.32, 1.73)
 """Sizes of the picture that the published multi-scale test merges (some add 2.28 and 3.0)."""
 LAST_BLOCKS = (1, 4)
-"""How many blocks a head may see: linear, ms."""
+"""Blocks that a head sees, counted from the last: linear, ms."""
 BAND_ROWS = 64
 """Rows of the picture that hold all classes at once."""
 

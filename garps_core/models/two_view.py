@@ -22,7 +22,7 @@ from garps_core.models.vit import EPSILON, Mlp
 from garps_core.weights.state_dict import load_strictly, recognised
 
 BASE = 100.0
-"""Of the rotations: from 1 radian per patch down to nearly 1/BASE."""
+"""Base of the rotations, which go from 1 radian per patch down to nearly 1/BASE."""
 HEAD_WIDTH = 64
 """Channels of an attention head in every published network; the tensors do not tell."""
 MOST_BLOCKS = 64
@@ -51,7 +51,7 @@ class Architecture:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Name of the architecture in words."""
         return "MASt3R" if self.descriptors else f"DUSt3R with a {'linear' if self.linear else 'DPT'} head"
 
 
@@ -106,7 +106,7 @@ class CrossAttention(nn.Module):
 
 
 class EncoderBlock(nn.Module):
-    """What attention adds to the tokens, then what the two-layer network adds."""
+    """Attention, then a two-layer network, each added to the tokens."""
 
     def __init__(self, size: Stack) -> None:
         super().__init__()
@@ -123,7 +123,7 @@ class EncoderBlock(nn.Module):
 
 
 class DecoderBlock(nn.Module):
-    """The same with a look at the other view between."""
+    """A block with attention to the other view between."""
 
     def __init__(self, size: Stack) -> None:
         super().__init__()
@@ -200,7 +200,7 @@ def _head(architecture: Architecture) -> nn.Module:
 
 
 def rotation(grid: Grid, width: int, device: torch.device | str = "cpu") -> Rotation:
-    """How far the head's channels of every patch of a grid are turned, row-major; width: of an attention head."""
+    """Rotations of the head's channels for every patch of a grid, row-major; width: of an attention head."""
     rows, columns = (torch.arange(n, dtype=torch.float32, device=device) for n in grid)
     places = torch.cartesian_prod(rows, columns)  # (N, 2)
     steps = torch.arange(0, width // 2, 2, dtype=torch.float32, device=device) / (width // 2)

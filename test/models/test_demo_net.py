@@ -56,7 +56,7 @@ def test_it_is_small() -> None:
 
 
 def test_the_package_with_it_stays_small(tmp_path: Path) -> None:
-    """As a wheel holds it: all of the three packages, compressed."""
+    """The three packages, compressed as in a wheel."""
     with zipfile.ZipFile(tmp_path / "all.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for package in ("garps_core", "garps_ros", "msg_adapters"):
             for path in (ROOT / package).rglob("*"):

@@ -15,12 +15,12 @@ from garps_core.models.vit import from_transformers as backbone_from_transformer
 
 NAME, HF = "dav2_vits_metric", "dav2_vits_metric_hf"
 SMALL = (60, 80)
-"""Of pictures for tests of what does not depend on their size; the network's side is made small, too."""
+"""Size of pictures where the test does not depend on it; the network's side is made small, too."""
 
 
 @pytest.fixture(scope="module")
 def tensors():
-    """Of the official file."""
+    """Tensors of the official file."""
     return {key: torch.from_numpy(value) for key, value in state(NAME).items()}
 
 
@@ -36,7 +36,7 @@ def small_side(monkeypatch):
 
 
 def hf_tensors(tensors, new=False):
-    """The same parameters in the `transformers` layout, `new` with the attention's newer names."""
+    """Parameters in the `transformers` layout, `new` with the attention's newer names."""
     held = {}
     for key, _, official, *rows in keys(HF)["files"]["model"]:
         if new:
@@ -238,7 +238,7 @@ def test_scale_and_focal_length_multiply_depth(model, small_side):
     ("dtype", "bound"), [(torch.bfloat16, 0.01), (torch.float16, 0.002)], ids=["bfloat16", "float16"]
 )
 def test_what_half_precision_costs(model, monkeypatch, dtype, bound):
-    """With pseudo-random weights: an upper bound of order, since depth there varies over a pixel as it never will."""
+    """An upper bound of order: with pseudo-random weights depth varies over a pixel as it never will."""
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 140)
     rgb = [image(120, 160)]
     (full,), (half,) = depth_of_images(model, rgb), depth_of_images(model, rgb, dtype=dtype)

@@ -79,7 +79,7 @@ def test_the_taps_are_the_last_four_blocks(networks: dict[str, Segmenter]) -> No
 
 
 def plainly_merged(network: Segmenter, rgb: np.ndarray, sizes: list[tuple[int, int]], flips: list[bool]) -> np.ndarray:
-    """The same, step by step as it is described, with whole pictures of all classes."""
+    """Compute the labels step by step, with whole pictures of all classes."""
     import cv2
 
     total = torch.zeros(150, *rgb.shape[:2])

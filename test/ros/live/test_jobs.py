@@ -63,13 +63,13 @@ def calls(monkeypatch):
         calls.append(given)
         return with_mixtures(replace(recordings.estimate(*given[:2]), initial=given[3]), *given[:2])
 
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(estimate))
     return calls
 
 
 def answering(monkeypatch, estimate):
     """Let the estimator be `estimate(source, target)`."""
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", lambda s, t, *_: with_mixtures(estimate(s, t), s, t))
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(lambda s, t, *_: with_mixtures(estimate(s, t), s, t)))
 
 
 def with_mixtures(estimate, *views):
