@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of a whole pair goes that comes without depth: both depths, mixtures, start, alignment.
+"""Time of each stage of a whole pair that comes without depth: both depths, mixtures, start, alignment.
 
 The weights are random, so the depth network computes all it has to, and then its output is replaced by a generated
 room's depth as such a network gives it. Otherwise the other stages would have nothing to work on. Flash3D keeps its own
