@@ -50,7 +50,7 @@ console = Console()
 
 @dataclass
 class Answers:
-    """What has come from the node."""
+    """Messages that have come from the node."""
 
     poses_s: dict[int, float] = field(default_factory=dict)
     """Arrival (steady time, s) by stamp, ns."""
