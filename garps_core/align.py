@@ -11,7 +11,7 @@ import numpy as np
 from garps_core.config import Config
 from garps_core.config.combinations import check_settings
 from garps_core.devices import checked_device
-from garps_core.errors import InitialisationError, ModelError, ReconstructionError, WeightsError
+from garps_core.errors import InitialisationError, MissingDepthError, ModelError, ReconstructionError, WeightsError
 from garps_core.mixture_alignment import align_mixtures, best_alignment
 from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, with_depth
 from garps_core.models.depth_networks import depth_from
@@ -55,7 +55,7 @@ class Estimator:
         Returns:
             PoseEstimate. Where no pose could be had, its status and reason say why and T_target_source is None.
         Raises:
-            ReconstructionError: a view has no depth where a sensor's is wanted.
+            MissingDepthError: a view has no depth, and the settings want a sensor's.
             ConfigError: the device is not there, or settings do not go together.
             WeightsError: the weights of a network are missing, or not the expected ones.
         """
@@ -97,7 +97,7 @@ class Estimator:
             stages.end("initialise")
             return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=stages.seconds), (source, target)
         except (ModelError, ReconstructionError) as failure:
-            if isinstance(failure, WeightsError) or not self._is_of_the_pair(failure):
+            if isinstance(failure, (WeightsError, MissingDepthError)):
                 raise  # a mistake in the settings, not a property of these images
             return PoseEstimate(Status.NO_MIXTURE, str(failure), seconds=stages.seconds), None
         estimate = best_alignment(source, target, starts, config)
@@ -110,9 +110,6 @@ class Estimator:
             return None
         check_settings(self.config)
         return self.networks.pair_maps(views[0].rgb, views[1].rgb, self.config)
-
-    def _is_of_the_pair(self, failure: Exception) -> bool:
-        return not isinstance(failure, ReconstructionError) or self.config.reconstruction.method == "two_view"
 
 
 @dataclass

@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from garps_core.align import Estimator
 from garps_core.config import PRESETS, Config, methods
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.errors import GarpsError
 from garps_core.models.depth_networks import preset_for
 from garps_core.models.in_use import Networks
@@ -34,6 +34,7 @@ from garps_ros.estimates.preparation import (
     settings_of_completed,
 )
 from garps_ros.frames.frame import CameraTopics
+from garps_ros.parameters.settings import RECTIFIED, NodeSettings, current_rectified
 from garps_ros.recording.bags import Bag, BagError
 from garps_ros.recording.frame_reader import Frames
 from garps_ros.recording.outputs import Outputs
@@ -45,7 +46,6 @@ from msg_adapters import NANOSECONDS
 NAME = "garps-replay"
 INTERRUPTED = 130
 ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
-ONE_OF_RECTIFIED = ("auto", "true", "false")
 GIVEN = "COMMANDLINE"
 LIVE_OPTIONS = {"rate", "loop", "topics", "wait"}
 """Options that need --to-ros."""
@@ -103,6 +103,13 @@ Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupte
 With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong input, 130 = interrupted.
 """
 
+Rectified = Annotated[str, typer.Option(help="Kind of the images: rectified, raw, or auto (by topic name).")]
+KeyframeOverlap = Annotated[float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)]
+KeyframeMotion = Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)]
+KeyframeRotation = Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)]
+LostAfter = Annotated[
+    int, typer.Option(help="New trajectory after this number of frames in a row without a pose.", min=1, max=1000)
+]
 Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
 Reconstruction = Annotated[
     str | None, typer.Option(help=f"Whose depth, one of {', '.join(methods()[:-1])}. [auto: the depth topics]")
@@ -136,26 +143,21 @@ def replay(
     ] = "auto",
     slop: Annotated[
         float, typer.Option(help="Largest difference of stamps that belong together, seconds.", min=0, max=10)
-    ] = 0.02,
-    rectified: Annotated[
-        str, typer.Option(help="Are the images rectified? auto (by topic name), true, false.")
-    ] = "auto",
-    keyframe_overlap: Annotated[
-        float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)
-    ] = 0.5,
-    keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
-    keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
-    keyframe_lost_after: Annotated[
-        int, typer.Option(help="New trajectory after this many frames in a row without a pose.", min=1, max=1000)
-    ] = 5,
+    ] = NodeSettings.sync_slop,
+    rectified: Rectified = NodeSettings.rectified,
+    keyframe_overlap: KeyframeOverlap = NodeSettings.keyframe_overlap,
+    keyframe_motion: KeyframeMotion = NodeSettings.keyframe_motion,
+    keyframe_rotation: KeyframeRotation = NodeSettings.keyframe_rotation,
+    keyframe_lost_after: LostAfter = NodeSettings.keyframe_lost_after,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Preset = None,
     reconstruction: Reconstruction = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+        list[str] | None,
+        typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+        Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
     ] = None,
     to_ros: ToRos = False,
     rate: Rate = 1.0,
@@ -168,7 +170,8 @@ def replay(
     if to_ros:
         return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
-    _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
+    rectified = current_rectified(rectified)
+    _check_choice("--rectified", rectified, RECTIFIED)
     config = _configured(preset, reconstruction, settings, set_ or [])
     rule = KeyframeRule(
         keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after, depth_share(config)
@@ -189,12 +192,9 @@ def replay(
 def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
     """Return the settings; where no preset is given, those of a network start from the preset for its depth."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
-
-    def changed(base: Config) -> Config:
-        return changed_config(base if file is None else read_settings(file, base), changes)
-
-    asked = changed(Config())
-    config = changed(Config.preset(preset or preset_for(asked.reconstruction.method, needs_depth(asked))))
+    config = configured(
+        preset, file, changes, lambda asked: preset_for(asked.reconstruction.method, needs_depth(asked))
+    )
     check_method(config)
     return config
 

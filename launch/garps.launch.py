@@ -46,7 +46,7 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
         "",
         (),
         "reconstruction.method: auto and rgbd take the depth topics; depth_anything_v2, demo_net, flash3d, two_view "
-        "and installed depth networks (garps doctor) do without; give them "
+        "and installed depth networks (`garps doctor` lists them) do without; give them "
         f"preset:=monocular, and two_view a start.method; preset:=mast3r has both; empty: {AS_IN_FILE}",
     ),
     ("image_transport", "", ("", "raw", "compressed"), f"compressed: subscribe IMAGE/compressed; empty: {AS_IN_FILE}"),

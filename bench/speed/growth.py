@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the cost grows with the number of components and of neighbours, all components used."""
+"""Growth of the cost with the number of components and of neighbours, all components used."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import TypeVar
 import numpy as np
 from rich.progress import track
 
+from bench.report.checks import Check, Row, Section
 from bench.speed.fresh import STEPS, all_used
-from bench.speed.parts import Check, Inputs, Row, Section, lifted, threads
+from bench.speed.parts import Inputs, lifted, threads
 from garps_core import Mixture, align_mixtures
 from garps_core.config import Rung
 from garps_core.objective.pairs import pair_up, to_device

@@ -22,7 +22,7 @@ from garps_core.cli.weights import app as weights_app
 from garps_core.config import PRESETS, Config, Reconstruction, methods
 from garps_core.config.combinations import check_settings
 from garps_core.config.start import STARTS, TWO_VIEW
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.mixtures.splat_reader import read_splats
@@ -37,10 +37,11 @@ ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
 Settings = Annotated[
-    Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+    Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
 ]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
@@ -133,10 +134,10 @@ def align(
     """
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
-    options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    method = _configured(Config(), settings, set_, options).reconstruction.method
-    base = Config.preset(preset or preset_for(method, splats or any(depths)))
-    config = _configured(base, settings, set_, options)
+    changes = _changes(set_, {"device": device, "reconstruction.method": reconstruction, "start.method": start})
+    with_depth = splats or any(depths)
+    config = configured(preset, settings, changes, lambda asked: preset_for(asked.reconstruction.method, with_depth))
+    checked_device(config.device)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -236,11 +237,9 @@ def _uncalibrated(
     return source, target, maps
 
 
-def _configured(base: Config, file: Path | None, changes: list[str] | None, options: dict[str, str | None]) -> Config:
-    given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(base if file is None else read_settings(file, base), changes or []).replace(given)
-    checked_device(config.device)
-    return config
+def _changes(given: list[str] | None, options: dict[str, str | None]) -> list[str]:
+    """Return NAME=VALUE of --set, then of options that stand for a setting."""
+    return [*(given or []), *(f"{name}={value}" for name, value in options.items() if value is not None)]
 
 
 def _intrinsics(option: str, values: Four) -> Float64Array:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this machine has, for a bug report: versions, devices, memory, and one tiny alignment."""
+"""The state of this machine for a bug report: versions, devices, memory, and one tiny alignment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DISTRIBUTIONS = {"cv2": ("opencv-python-headless", "opencv-python", "opencv-cont
 
 
 def examine() -> tuple[list[tuple[str, str]], bool]:
-    """Rows (name, finding) for people, and whether everything that is needed works."""
+    """Return rows (name, result) for people, and whether everything that is needed works."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}"), ("garps", version_of("garps_ros"))]
     missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
     rows += [(name, "MISSING: install it" if name in missing else version_of(name)) for name in REQUIRED]

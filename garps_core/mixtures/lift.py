@@ -17,8 +17,8 @@ import numpy.typing as npt
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
-from garps_core.errors import ReconstructionError
-from garps_core.mixtures.edges import away_from_edges
+from garps_core.edges import away_from_edges
+from garps_core.errors import MissingDepthError, ReconstructionError
 from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.types import Mixture, View
 
@@ -34,10 +34,11 @@ def lift(view: View, lifting: Lifting) -> Mixture:
     Returns:
         Mixture of float32 arrays, about HW / stride^2 components.
     Raises:
-        ReconstructionError: no depth given, or fewer than 50 usable pixels.
+        MissingDepthError: no depth given.
+        ReconstructionError: fewer than 50 usable pixels.
     """
     if view.depth is None:
-        raise ReconstructionError("the view has no depth: expected HxW float32 metres; give View(..., depth=...)")
+        raise MissingDepthError("the view has no depth: expected HxW float32 metres; give View(..., depth=...)")
     depth = in_range(view.depth, lifting)
     rows, columns = _sampled(depth, lifting)
     if len(rows) < MIN_COMPONENTS:

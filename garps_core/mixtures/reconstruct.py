@@ -2,7 +2,7 @@
 """View -> Mixture: from the sensor's depth, from a depth network's, or by Flash3D on either.
 
     view -> with_depth: the sensor's, a depth network's of all views in one pass, or that of the two-view network which
-            also gives the initial pose
+            also gives the start pose
          -> mixture_of: lifted pixel by pixel, or two Gaussians per pixel by Flash3D; labels where asked for
 
 `config.reconstruction.method` chooses. Every function takes the `Networks` that it asks; without any it loads its own
@@ -39,7 +39,8 @@ def reconstruct(view: View, config: Config | None = None, networks: Networks | N
     Returns:
         Mixture, components along a Z-order curve (but in the published order for the paper's solver).
     Raises:
-        ReconstructionError: no depth where a sensor's is wanted, or too few usable pixels.
+        MissingDepthError: no depth where a sensor's is wanted.
+        ReconstructionError: too few usable pixels, or depth beyond the network's range.
         ConfigError: settings that do not go together.
         WeightsError: weights that are not installed, or not what they should be.
         ModelError: a network that does not fit the memory, or whose output is not finite.
@@ -125,8 +126,7 @@ def mixture_of(view: View, config: Config, networks: Networks | None = None) -> 
     if mixture is not None:
         return mixture if labels is None else labelled(mixture, labels, view.K)
     gaussians = predict_gaussians(networks.flash3d(config), view, settings.drop_border, dtype_of(config))
-    published = config.alignment.solver == "adam"
-    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not published)
+    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not config.published_order)
 
 
 def mixtures_of(views: Sequence[View], config: Config, networks: Networks | None = None) -> list[Mixture]:

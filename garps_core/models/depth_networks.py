@@ -23,7 +23,7 @@ from garps_core.weights.store import default
 
 N = TypeVar("N")
 DEFAULT = "depth_anything_v2"
-"""Name of the network behind the methods that want depth and name none: `auto` and `flash3d`."""
+"""Name of the network that the methods `auto` and `flash3d` take depth from."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class DepthNetwork(Generic[N]):
     """A network that gives metric depth of single views.
 
     Args:
-        description: what it is, for lists of networks.
+        description: a few words for lists of networks.
         load: (weights, scene, device) -> the network, ready on that device. `weights` and `scene` are
             `reconstruction.depth_weights` and `reconstruction.scene`; "" and "any" leave the choice to the network.
             The network is kept until one of the three changes.
         depths: (network, views, settings) -> depth of each view along its optical axis, HxW float32 metres, finite,
             0 = unknown. `reconstruction.depth_scale` is applied to it afterwards.
         preset: name of the preset that goes with its errors.
-        warning: what everybody who uses its depth must know; it is logged, and printed with every estimate.
+        warning: a limitation that every user must know; it is logged, and printed with every estimate.
         weights_kind: kind of its weights in `garps weights list`, "" = none of them.
     """
 
@@ -157,7 +157,7 @@ def presets() -> dict[str, str]:
 
 
 def depth_from(views: Sequence[View], config: Config) -> str:
-    """Where the depth of the views' mixtures comes from, for people: "given", or a network with its warning."""
+    """Return the source of the depth of the views' mixtures, for people: "given", or a network with its warning."""
     method = config.reconstruction.method
     if method == "two_view":
         return config.start.method
@@ -170,7 +170,7 @@ def depth_from(views: Sequence[View], config: Config) -> str:
 
 
 def with_weights(settings: Reconstruction) -> str:
-    """The depth network of the settings with its weights or, where it has none of the list, with what it is.
+    """The depth network of the settings with its warning, else with its weights or, without any, its description.
 
     Raises WeightsError where weights of the list are needed and none are installed.
     """
@@ -178,4 +178,4 @@ def with_weights(settings: Reconstruction) -> str:
     network, weights = depth_network(name), settings.depth_weights
     if network.weights_kind and not weights:
         weights = default(network.weights_kind, "" if settings.scene == "any" else settings.scene).name
-    return f"{name} ({f'weights {weights}' if weights else network.warning or network.description})"
+    return f"{name} ({network.warning or (f'weights {weights}' if weights else network.description)})"

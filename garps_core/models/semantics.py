@@ -33,7 +33,7 @@ from garps_core.weights.store import installed
 RATIOS = (1.0, 1.32, 1.73)
 """Sizes of the picture that the published multi-scale test merges (some add 2.28 and 3.0)."""
 LAST_BLOCKS = (1, 4)
-"""How many blocks a head may see: linear, ms."""
+"""Blocks that a head sees, counted from the last: linear, ms."""
 BAND_ROWS = 64
 """Rows of the picture that hold all classes at once."""
 
@@ -188,7 +188,7 @@ def scores_of(
     height, width = image.shape[:2]
     size = (max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5)))
     picture = image if size == (height, width) else cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR)
-    given = prepared(np.asarray(picture[:, ::-1] if mirrored else picture, np.uint8)).to(device)
+    given = padded_input(np.asarray(picture[:, ::-1] if mirrored else picture, np.uint8)).to(device)
     try:
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             patches: Tensor = network(given)[0]
@@ -203,7 +203,7 @@ def scores_of(
     return Scores(patches @ (columns.flip(0) if mirrored else columns).T, rows)
 
 
-def prepared(picture: RGBImage) -> Tensor:
+def padded_input(picture: RGBImage) -> Tensor:
     """HxWx3 uint8 RGB -> (1, 3, H', W') float32, normalised, zeros around it up to multiples of 14.
 
     Of an odd number of missing rows or columns the larger half comes below or at the right.

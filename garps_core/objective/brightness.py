@@ -25,9 +25,9 @@ import torch
 
 from garps_core.checks import Float32Array
 from garps_core.depth_errors import error_fields
+from garps_core.edges import GRID_EDGE_RATIO, away_from_edges
 from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
-from garps_core.mixtures.edges import GRID_EDGE_RATIO, away_from_edges
 from garps_core.objective.visibility import SAME_SURFACE_RATIO, surface_at
 
 GRIDS = (8, 4, 2, 1)

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.config.start import Start
+from garps_core.edges import MATCH_EDGE_RATIO, MATCH_SLACK_M, one_surface
 from garps_core.geometry import Array, pixel_rays
-from garps_core.mixtures.edges import MATCH_EDGE_RATIO, MATCH_SLACK_M, one_surface
 from garps_core.types import View
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from garps_core.checks import Float64Array
 from garps_core.errors import ReconstructionError
 from garps_core.geometry import skew, so3_log
 from garps_core.types import PoseEstimate, View
+from garps_ros.parameters.settings import NodeSettings
 
 Estimate = Callable[[View, View], PoseEstimate]
 """A function (source, target) -> pose of the source camera in the target camera."""
@@ -31,10 +33,10 @@ class KeyframeRule:
         min_depth_share: a view with depth at a smaller share of its pixels begins no segment.
     """
 
-    min_overlap: float = 0.5
-    max_motion_m: float = 0.3
-    max_rotation_rad: float = 0.35
-    lost_after: int = 5
+    min_overlap: float = NodeSettings.keyframe_overlap
+    max_motion_m: float = NodeSettings.keyframe_motion
+    max_rotation_rad: float = math.radians(NodeSettings.keyframe_rotation)
+    lost_after: int = NodeSettings.keyframe_lost_after
     min_depth_share: float = MIN_DEPTH_SHARE
 
 

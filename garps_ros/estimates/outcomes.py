@@ -77,7 +77,7 @@ class ViewReader:
     """Makes a View of a Frame; says which calibration is used, at first and whenever that changes.
 
     Args:
-        rectified: "auto", "true" or "false".
+        rectified: "auto", "rectified" or "raw".
         say: called with a line for people.
         allow_resized: accept images that were scaled evenly against their CameraInfo.
     """

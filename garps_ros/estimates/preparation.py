@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is settled before the first pair, live and offline: whose depth it is, networks loaded, loops compiled."""
+"""Preparation before the first pair, live and offline: the source of depth, networks loaded, loops compiled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
 LONG_S = 2.0
-"""Compiled loops that are read from where they were kept take less; more is worth a line."""
+"""Time of compiling beyond which a line is logged, s; loops that are read from the cache take less."""
 
 
 def methods_without_sensor() -> tuple[str, ...]:
@@ -66,7 +66,7 @@ def settings_of_completed(config: Config) -> Config:
 
 
 def scale_from(config: Config) -> str:
-    """Where metres come from, for people. Raises WeightsError where the settings' weights are not installed."""
+    """Return the source of metres, for people. Raises WeightsError where the settings' weights are not installed."""
     if needs_depth(config):
         return "the depth topics, m"
     from garps_core.weights.store import default  # networks cost nothing where none is used

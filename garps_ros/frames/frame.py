@@ -9,6 +9,9 @@ from typing import Any
 from garps_core.types import View
 from msg_adapters import camera_from_info, depth_image, header_frame_id, header_stamp_ns, rgb_image
 
+FOR_THE_ADAPTER = {"auto": "auto", "rectified": "true", "raw": "false"}
+"""Values of the setting `rectified` as `camera_from_info` takes them."""
+
 
 @dataclass(frozen=True)
 class CameraTopics:
@@ -57,7 +60,7 @@ def view_from_messages(
         info: sensor_msgs/CameraInfo of the image.
         depth: sensor_msgs/Image or CompressedImage, of the same size and lens as the image; None = no depth.
         topic: the image's topic, from which "auto" reads whether the image is rectified.
-        rectified: "auto", "true" or "false", see `camera_from_info`.
+        rectified: "rectified" = P of the CameraInfo counts, "raw" = its K and D count, or "auto".
         allow_resized: accept an image that was scaled evenly against its CameraInfo.
     Returns:
         The view without distortion, stamp and frame those of the image; and a text that says which calibration was
@@ -68,7 +71,11 @@ def view_from_messages(
     """
     rgb = rgb_image(image)
     camera = camera_from_info(
-        info, (rgb.shape[1], rgb.shape[0]), topic=topic, rectified=rectified, allow_resized=allow_resized
+        info,
+        (rgb.shape[1], rgb.shape[0]),
+        topic=topic,
+        rectified=FOR_THE_ADAPTER[rectified],
+        allow_resized=allow_resized,
     )
     metres = None if depth is None else depth_image(depth)
     rgb, metres = camera.rectify(rgb, metres)

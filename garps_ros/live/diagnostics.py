@@ -136,7 +136,7 @@ class Diagnostics:
             slop = f"sync_slop = {state.settings.sync_slop:g} s"
             level, message = Level.WARN, f"images arrive, but none belong together within {slop}: {apart}"
         elif rejected:
-            level, message = Level.WARN, f"{rejected} rejected in the last second: {self._counts.last_rejected}"
+            level, message = Level.WARN, f"{rejected} pair(s) rejected in the last second: {self._counts.last_rejected}"
         lines = _estimate_lines(state, self._counts) | _latency_lines(self._counts) | self._last
         return Check("estimates", level, message, lines)
 

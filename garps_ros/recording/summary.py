@@ -22,8 +22,6 @@ class Summary:
     """Messages that could not be used at all."""
     first_refused: str = ""
     unpaired: int = 0
-    keyframes: int = 0
-    segments: int = 0
     broken_end: str = ""
     seconds: list[float] = field(default_factory=list)
     """Wall time of each pair from messages to pose, s."""
@@ -50,9 +48,6 @@ class Summary:
         table.add_row("poses used", str(self.used))
         for status, count in sorted(self.rejected.items()):
             table.add_row(f"rejected: {status}", str(count))
-        if self.segments:
-            table.add_row("keyframes", str(self.keyframes))
-            table.add_row("segments", str(self.segments))
         table.add_row("messages without partner", str(self.unpaired))
         table.add_row("messages refused", str(self.refused))
         if self.first_refused:

@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 import pytest
 from depth_distribution import FAILING, NAME, install_depth_networks, write_depths
+from distributions import write_distribution
+from places import ROOT
 
 from garps_core import Config, ConfigError, Status, View, estimate_relative_pose, metrics
 from garps_core.cli import command
 from garps_core.cli.doctor import examine
 from garps_core.config import depth_networks, methods
-from garps_core.config.reconstruction import DEPTH_NETWORKS
+from garps_core.config.reconstruction import DEPTH_NETWORKS, DEPTH_PLUGINS
 from garps_core.errors import WeightsError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models.demo_net import DemoNet
@@ -133,16 +135,16 @@ def test_a_recording_is_replayed_with_it(room: RoomPair, depths: Path, tmp_path:
 
 
 def test_the_node_takes_the_parameter_loads_it_and_names_it(depths: Path) -> None:
-    from garps_ros.live.estimator import Solver
+    from garps_ros.live.jobs import JobRunner
     from garps_ros.parameters.parameter import parameters, settings_from
 
     given = {parameter.name: parameter.default for parameter in parameters("monocular")}
     given |= {"preset": "monocular", "reconstruction.method": NAME, "reconstruction.depth_weights": str(depths)}
     _, config = settings_from(given)
     said: list[str] = []
-    solver = Solver(said.append)
-    solver.prepare(config)
-    assert solver.scale == f"{NAME} (weights {depths}), m", "what /diagnostics shows as `scale from`"
+    runner = JobRunner(said.append)
+    runner.prepare(config)
+    assert runner.scale == f"{NAME} (weights {depths}), m", "what /diagnostics shows as `scale from`"
     assert said[0].startswith(f"loaded {NAME} (weights {depths}) in ")
 
 
@@ -182,3 +184,41 @@ def test_every_network_of_this_package_has_its_entry() -> None:
     for name in DEPTH_NETWORKS:
         assert depth_network(name).preset in ("monocular", name)
         assert Config.preset(depth_network(name).preset).alignment.depth_errors
+
+
+WALL = '''
+"""A wall two metres ahead, bent by what the pictures show."""
+import torch
+
+
+class Wall(torch.nn.Conv2d):
+    def forward(self, pictures):
+        return 2 + super().forward(pictures)[:, 0]
+
+
+def load_network(weights):
+    torch.manual_seed(2)
+    return Wall(3, 1, 5, padding=2).eval()
+'''
+
+
+def test_the_documented_network_runs_as_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: RoomPair, capsys: Captured
+) -> None:
+    section = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8").split("## A depth network\n")[1]
+    code = section.split("```python\n")[1].split("\n```")[0]
+    assert max(map(len, code.split("\n"))) <= 120 and 'my_depth = "my_robot.depth:NETWORK"' in section
+    package = tmp_path / "my_robot"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "depth.py").write_text(code + "\n", encoding="utf-8")
+    (package / "depth_network.py").write_text(WALL, encoding="utf-8")
+    write_distribution(tmp_path, "my_robot", DEPTH_PLUGINS, {"my_depth": "my_robot.depth:NETWORK"})
+    monkeypatch.syspath_prepend(str(tmp_path))
+    try:
+        code_of_exit = command.main([*written(room, tmp_path), "--reconstruction", "my_depth", "--json"])
+    finally:
+        for module in ("my_robot", "my_robot.depth", "my_robot.depth_network"):
+            sys.modules.pop(module, None)
+    found = json.loads(capsys.readouterr().out)
+    assert code_of_exit in (0, 1) and found["depth_from"] == "my_depth" and found["seconds"]["depth"] > 0

@@ -84,7 +84,7 @@ def test_two_pictures_by_the_depth_network_alone(files: dict[str, str], capsys: 
 
 
 def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captured) -> None:
-    """Even with pseudo-random offsets around it, the pose is near the truth then."""
+    """The pose is near the truth even with pseudo-random offsets around the depth."""
     depths = ["--depth-source", files["a_mm"], "--depth-target", files["b_mm"]]
     with passes(networks()[0]) as of_depth:
         command.main(["align", files["a"], files["b"], *K_WORDS, *depths, "--reconstruction", "flash3d", "--json"])
@@ -126,7 +126,7 @@ def test_a_lifted_component_has_the_label_of_its_pixel(head: str) -> None:
 
 
 def test_both_gaussians_of_a_pixel_have_its_label() -> None:
-    """In the order that the published solver needs, where each component is told from its place in the list."""
+    """Components come in the order of the published solver, which tells them by their place in the list."""
     changes = {"reconstruction.method": "flash3d", "reconstruction.semantics": "linear", "lifting.max_range_m": 1000.0}
     config = Config.preset("paper").replace(changes)
     (view,) = with_depth(pair()[:1], config, shared())
@@ -157,7 +157,7 @@ def test_different_labels_count_for_less_where_there_are_labels(method: str) -> 
 
 
 def test_heads_take_the_backbone_that_is_there(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under either of its names, or a file."""
+    """The backbone has two names, and may be a file."""
     for name in ("dinov2_vits14_ade20k_linear_head.pth", "dinov2-small-hf.safetensors"):
         (tmp_path / name).write_bytes(
             (weights / name.replace("-small-hf.safetensors", "_vits14_pretrain.pth")).read_bytes()
@@ -220,7 +220,7 @@ def test_splats_and_pictures_do_not_mix(
 
 
 def test_the_published_pipeline_is_one_command(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
-    """Up to its mixtures; with a reduced Mask2Former, since the published one has gigabytes."""
+    """It is run up to its mixtures, with a reduced Mask2Former, since the published one has gigabytes."""
     published = ["--preset", "paper", "--reconstruction", "flash3d", "--set", "reconstruction.semantics=m2f"]
     assert command.main(["align", files["a"], files["b"], *K_WORDS, *published]) == 2
     assert "download it from https://dl.fbaipublicfiles.com/dinov2/dinov2_vitg14/" in capsys.readouterr().err

@@ -29,7 +29,7 @@ from garps_core.types import Mixture
 DOCUMENT = ROOT / "docs" / "two_view_models.md"
 ERRORS = Errors(noise=0.005, patches=0.005, scale=0.03)
 LARGEST_NEES = 22.46
-"""Of six numbers, with 99.9 %."""
+"""Bound of NEES of six numbers, 99.9 %."""
 BY_PAIR = {"reconstruction.method": "two_view", "alignment.depth_errors": True}
 Captured = pytest.CaptureFixture[str]
 
@@ -49,7 +49,7 @@ def adapters(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def said(room: RoomPair) -> PairMaps:
-    """Of the room, with modest errors."""
+    """Maps of the room with modest errors."""
     return point_maps(true_views(room), room.T_1_0, ERRORS, seed=1)
 
 
@@ -108,7 +108,7 @@ def test_pose_and_depth_of_two_pictures_from_one_answer(room: RoomPair, maps: Pa
     assert estimate.seconds["depth"] > 0
 
 
-def test_a_sensors_depth_sharpens_it(room: RoomPair, maps: Path) -> None:
+def test_a_sensors_depth_refines_it(room: RoomPair, maps: Path) -> None:
     estimate = estimate_relative_pose(*sensed(room), recorded(maps, "default"))
     assert estimate.status is Status.CONVERGED, estimate.reason
     assert estimate.initial is not None and "metres as the network says" in estimate.initial.reason
@@ -120,7 +120,7 @@ def test_a_sensors_depth_sharpens_it(room: RoomPair, maps: Path) -> None:
 
 
 @pytest.mark.parametrize(("method", "preset"), [("two_view", "monocular"), ("auto", "default")])
-def test_estimated_intrinsics_are_told_and_doubted(room: RoomPair, maps: Path, method: str, preset: str) -> None:
+def test_estimated_intrinsics_widen_the_covariance(room: RoomPair, maps: Path, method: str, preset: str) -> None:
     views = bare(room) if method == "two_view" else sensed(room)
     settings = recorded(maps, preset, reconstruction__method=method)
     K = estimate_intrinsics(room.rgb0, room.rgb1, settings, shared())
@@ -337,7 +337,7 @@ def test_the_documented_adapter_runs_as_it_stands(
 
 
 def test_the_documented_adapter_says_what_its_network_sees(robot: Path) -> None:
-    """Both orders, with the framing of the whole picture."""
+    """The adapter gives both orders, with the framing of the whole picture."""
     from my_robot.network import Network
     from my_robot.two_view import load
 

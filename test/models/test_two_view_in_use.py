@@ -229,7 +229,7 @@ def test_what_is_not_finite_is_a_status(files: Files, tmp_path: Path, capsys: Ca
         ),
         (["--preset", "mast3r", "--start", "auto", "K"], "expected a two-view network to start with, one of mast3r"),
         (["--preset", "monocular", "--reconstruction", "two_view", "K"], "and start.method is auto: expected a two-v"),
-        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would promise too much"),
+        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would be too small"),
         (
             ["--preset", "mast3r", "K", "weights=dust3r-dpt"],
             "dust3r-dpt are weights of dust3r: expected some of mast3r",
@@ -292,7 +292,7 @@ def test_a_picture_that_is_too_long_is_said(files: Files, tmp_path: Path, capsys
 
 
 class Hostile:
-    """What a pickle should not bring."""
+    """A class that no pickle may bring."""
 
 
 @pytest.mark.parametrize("words", [["--preset", "mast3r"], ["--preset", "mast3r", *K_WORDS]])
@@ -311,7 +311,7 @@ def test_a_file_with_another_class_is_not_opened(
 def test_the_licence_is_told_as_weights_are_loaded(
     files: Files, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Also for a file that somebody has renamed."""
+    """A renamed file is recognised, too."""
     for path in weights.iterdir():
         os.link(path, tmp_path / path.name)
     os.link(weights / "mast3r.safetensors", tmp_path / "renamed.safetensors")
@@ -354,7 +354,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
 def test_a_converted_file_is_the_same_network(
     files: Files, weights: Path, tmp_path: Path, name: str, capsys: Captured
 ) -> None:
-    """Under a name of one's own, with its kind, licence and variant inside; `check` knows it too."""
+    """The file has another name, with its kind, licence and variant inside; `check` knows it."""
     source, target, kind = weights / BY_NAME[name].local, tmp_path / "mine.safetensors", BY_NAME[name].kind
     assert command.main(["weights", "convert", str(source), str(target)]) == 0
     printed = capsys.readouterr().out

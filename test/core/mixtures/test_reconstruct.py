@@ -20,7 +20,7 @@ from garps_core.devices import on_device
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.mixtures import reconstruct as reconstruction
 from garps_core.models import depth_anything
-from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of
+from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of_images
 from garps_core.weights.manifest import BY_NAME
 
 MONOCULAR = Config.preset("monocular")
@@ -73,7 +73,7 @@ def test_both_views_share_one_pass_of_the_installed_network() -> None:
     with passes(network()) as seen:
         found = with_depth(views, MONOCULAR)
     assert seen == [(2, 3, 70, 98)]
-    expected = depth_of(network(), [view.rgb for view in views])
+    expected = depth_of_images(network(), [view.rgb for view in views])
     for view, given, depth in zip(found, views, expected, strict=True):
         np.testing.assert_array_equal(view.depth, depth)
         assert given.depth is None and view.rgb is given.rgb
@@ -92,7 +92,7 @@ def test_only_the_network_that_is_named_replaces_a_sensor(method: str) -> None:
     views = pair(depth=True)
     found = with_depth(views, asked(method=method))
     if method == "depth_anything_v2":
-        (expected,) = depth_of(network(), [views[0].rgb])
+        (expected,) = depth_of_images(network(), [views[0].rgb])
         np.testing.assert_allclose(found[0].depth, expected, atol=2e-3)
         assert np.abs(found[0].depth - views[0].depth).mean() > 1
     else:

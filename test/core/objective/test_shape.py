@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import INLINE
 from surfaces import moved, permuted, random_mixture, random_pose
 
 from garps_core import Config
@@ -257,7 +258,7 @@ def test_moving_both_frames_moves_the_pose(form, seed):
 def test_swapping_the_views_inverts_the_pose():
     back = se3_inverse(POSE)
     forward, backward = all_pairs(k=9), all_pairs(PARTNERS, ROWS, back, k=9)
-    e, swapped = two_way(forward, backward, State(POSE)), two_way(backward, forward, State(back))
+    e, swapped = two_way(forward, backward, State(POSE), INLINE), two_way(backward, forward, State(back), INLINE)
     A = -adjoint(back)  # the left twist of T^-1 that a left twist of T makes
     assert swapped.value == pytest.approx(e.value, rel=1e-12)
     np.testing.assert_allclose(A.T @ swapped.gradient, e.gradient, atol=1e-12 * np.abs(e.gradient).max())
@@ -270,10 +271,10 @@ def test_gradient_of_both_directions_is_that_of_central_differences():
     forward, backward = all_pairs(k=9), all_pairs(PARTNERS, ROWS, se3_inverse(POSE), k=9)
 
     def value(twist):
-        return two_way(forward, backward, State(se3_exp(twist) @ POSE)).value
+        return two_way(forward, backward, State(se3_exp(twist) @ POSE), INLINE).value
 
     numeric = [(value(1e-5 * e) - value(-1e-5 * e)) / 2e-5 for e in np.eye(6)]
-    gradient = two_way(forward, backward, State(POSE)).gradient
+    gradient = two_way(forward, backward, State(POSE), INLINE).gradient
     np.testing.assert_allclose(gradient, numeric, atol=1e-6 * np.abs(gradient).max())
 
 

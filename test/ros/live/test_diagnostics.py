@@ -186,7 +186,7 @@ def test_a_rejection_is_a_warning_with_its_reason_for_a_second():
     node.counts.reject("degenerate", "one direction is open")
     first, second = estimates(node), estimates(node)
     assert first.level == Level.WARN
-    assert first.message == "2 rejected in the last second: degenerate: one direction is open"
+    assert first.message == "2 pair(s) rejected in the last second: degenerate: one direction is open"
     assert second.level == Level.OK
     assert second.values["rejected: low_overlap"] == second.values["rejected: degenerate"] == "1"
     assert second.values["last rejected"] == "degenerate: one direction is open"

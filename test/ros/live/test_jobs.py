@@ -63,13 +63,13 @@ def calls(monkeypatch):
         calls.append(given)
         return with_mixtures(replace(recordings.estimate(*given[:2]), initial=given[3]), *given[:2])
 
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(estimate))
     return calls
 
 
 def answering(monkeypatch, estimate):
     """Let the estimator be `estimate(source, target)`."""
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", lambda s, t, *_: with_mixtures(estimate(s, t), s, t))
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(lambda s, t, *_: with_mixtures(estimate(s, t), s, t)))
 
 
 def with_mixtures(estimate, *views):
@@ -291,7 +291,7 @@ def test_rotation_is_in_degrees(monkeypatch, degrees, expected):
 def test_settings_of_the_calibration_take_effect_and_are_said(calls):
     lines, P = [], np.hstack([np.diag([80.0, 80, 1]), np.zeros((3, 1))])
     by, frames = JobRunner(lines.append), (frame(1, P=P), frame(1, "target", P=P))
-    for rectified, focal in (("auto", 50), ("true", 80), ("false", 50)):
+    for rectified, focal in (("auto", 50), ("rectified", 80), ("raw", 50)):
         solve(*frames, by=by, settings=replace(SETTINGS, rectified=rectified))
         assert {view.K[0, 0] for view in calls[-1][:2]} == {focal}, rectified
     assert len(lines) == 6 and lines[0].startswith("/source/image: ") and lines[1].startswith("/target/image: ")

@@ -14,7 +14,7 @@ pytest.importorskip("rclpy")
 import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
-from recordings import COVARIANCE, moved
+from recordings import COVARIANCE, answering, moved
 
 from garps_core.types import PoseEstimate, Status
 from garps_ros.live import jobs
@@ -93,7 +93,7 @@ def estimates(monkeypatch):
         found = PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9) if fault is None else fault()
         return found, None
 
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(jobs, "Estimator", answering(estimate))
     return Estimates
 
 

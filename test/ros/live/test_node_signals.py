@@ -22,7 +22,7 @@ NODES = {
     "busy_term": (signal.SIGTERM, True),
 }
 CHEAP = ["-p", "lifting.stride:=4"]
-COSTLY = ["-p", "preset:=paper", "-p", "lifting.stride:=1", "-p", "alignment.component_stride:=1"]
+COSTLY = "preset: paper\nlifting.stride: 1\npaper.component_stride: 1\n"
 """Settings of a computation of a thousand steps over all components: still under way when the second signal comes."""
 
 
@@ -61,6 +61,13 @@ class Stage:
             node.wait(0.01)
 
 
+def costly(folder: Path) -> tuple[str, str]:
+    """Arguments of a node with these settings."""
+    file = folder / "costly.yaml"
+    file.write_text(COSTLY, encoding="utf-8")
+    return "-p", f"settings_file:={file}"
+
+
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
     with (
@@ -89,7 +96,7 @@ def test_a_signal_ends_nodes_that_idle_and_nodes_that_compute(stage, tmp_path, t
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_computation_that_takes_longer_is_not_waited_for(stage, tmp_path, number):
-    with stage.node("busy_int", tmp_path, *COSTLY) as node:
+    with stage.node("busy_int", tmp_path, *costly(tmp_path)) as node:
         computing(stage, node)
         node.signal(number)
         stage.ended(node)
@@ -97,7 +104,7 @@ def test_a_computation_that_takes_longer_is_not_waited_for(stage, tmp_path, numb
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_ends_it_at_once(stage, tmp_path, number):
-    node = stage.node("busy_int", tmp_path, *COSTLY)
+    node = stage.node("busy_int", tmp_path, *costly(tmp_path))
     computing(stage, node)
     node.signal(number)
     stage.stream(0.5)

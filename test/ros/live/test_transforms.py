@@ -206,7 +206,7 @@ def ros(monkeypatch, tmp_path):
 
 
 def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd):
-    monkeypatch.setattr(jobs, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(recordings.estimate))
     node = PoseNode(ros)
     executor = SingleThreadedExecutor(context=ros.context)
     executor.add_node(ros)

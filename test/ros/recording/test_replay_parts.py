@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import COVARIANCE, estimate, frames, moved, picture, write
+from recordings import COVARIANCE, answering, estimate, frames, moved, picture, write
 from ros_messages import LIBRARIES, camera_info, image
 from scipy.spatial.transform import Rotation
 
@@ -265,7 +265,7 @@ def test_a_trajectory_begins_after_as_many_usable_views_as_asked_for(lost_after)
 
 @pytest.mark.parametrize(("lost_after", "segments"), [(2, 2), (3, 1)])
 def test_the_replay_is_told_after_how_many(tmp_path, monkeypatch, lost_after, segments):
-    monkeypatch.setattr(replay, "estimate_relative_pose", partial(estimate, bad=(3, 4)))
+    monkeypatch.setattr(replay, "Estimator", answering(partial(estimate, bad=(3, 4))))
     bag, out = write(tmp_path, "mcap", frames(["/cam"], 6, "rosbags")), tmp_path / "out"
     assert replay.main([str(bag), "--out", str(out), "--keyframe-lost-after", str(lost_after)]) == 0
     assert len(list(out.glob("trajectory*.tum"))) == segments

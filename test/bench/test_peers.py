@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 from installed_peers import ON_THE_WALL, method
 
-from bench.pairs import datasets
-from bench.peers.baselines import METHODS, NEED_NO_START
+from bench.pairs.depths import with_monocular_depth
+from bench.pairs.pair import Pair, rng_of, scene_points
+from bench.pairs.readers.pairs_json import HALVES, RGBD_SETS, available, ids_of_half, load_pairs
+from bench.pairs.starts import disturbed, disturbed_prior
 from bench.peers.features_pnp import features_pnp
+from bench.peers.methods import METHODS, NEED_NO_START
 from bench.peers.odometry import with_intrinsics
 from bench.peers.registration import FAST_LEVELS, cloud, without_edges
-from bench.scoring import tables
+from bench.report import run_tables
+from bench.scoring import summary
 from garps_core import View, metrics
 from garps_core.geometry import project, se3_exp, transform
 
@@ -44,7 +48,7 @@ def textured_wall(T_target_source=None, shape=(240, 320)):
 def pair():
     T = se3_exp(np.array([0.08, -0.05, 0.06, 0.02, -0.04, 0.03]))
     source = textured_wall()
-    return datasets.Pair("wall", "wall", "small", source, textured_wall(T), T, datasets.scene_points(source))
+    return Pair("wall", "wall", "small", source, textured_wall(T), T, scene_points(source))
 
 
 def test_the_two_views_agree(pair):
@@ -56,7 +60,7 @@ def test_the_two_views_agree(pair):
 
 @pytest.mark.parametrize("name", ON_THE_WALL)
 def test_peer_finds_the_pose(name, pair):
-    start = datasets.disturbed(pair.T_target_source, pair.points, datasets.rng_of("wall"))
+    start = disturbed(pair.T_target_source, pair.points, rng_of("wall"))
     T, reason = method(name)(pair.source, pair.target, None if name in NEED_NO_START else start)
     assert T is not None, reason
     assert metrics.error_3d_m(T, pair.T_target_source, pair.points) < 0.01
@@ -87,7 +91,7 @@ def test_odometry_sees_a_target_of_another_camera(pair):
     seen = (u >= 0) & (u < 320) & (v >= 0) & (v < 240)
     off = np.abs(other.depth[v[seen], u[seen]] - x[seen, 2])
     assert np.nanmax(off) < 0.03
-    start = datasets.disturbed(pair.T_target_source, pair.points, datasets.rng_of("wall"))
+    start = disturbed(pair.T_target_source, pair.points, rng_of("wall"))
     T, reason = METHODS["rgbd-hybrid"](pair.source, other, start)
     assert T is not None, reason
     # `other` says its own intrinsics, so it is resampled once more, to the source's.
@@ -96,14 +100,14 @@ def test_odometry_sees_a_target_of_another_camera(pair):
 
 def test_halves_are_disjoint_stable_and_whole():
     ids = [f"pair{i}" for i in range(11)]
-    halves = {name: datasets.ids_of_half(ids, name) for name in datasets.HALVES}
+    halves = {name: ids_of_half(ids, name) for name in HALVES}
     assert not halves["dev"] & halves["held-out"]
     assert halves["dev"] | halves["held-out"] == halves["all"] == set(ids)
     assert (len(halves["dev"]), len(halves["held-out"])) == (6, 5)
-    assert datasets.ids_of_half(ids[::-1], "dev") == halves["dev"]
+    assert ids_of_half(ids[::-1], "dev") == halves["dev"]
     assert halves["held-out"] == {"pair0", "pair1", "pair2", "pair7", "pair8"}
     with pytest.raises(ValueError, match="half is 'odd'"):
-        datasets.ids_of_half(ids, "odd")
+        ids_of_half(ids, "odd")
 
 
 def test_features_work_with_depth_on_one_side_only(pair):
@@ -128,19 +132,19 @@ def test_cloud_leaves_out_edges():
 
 def test_disturbance_has_its_size_and_its_seed(pair):
     T = pair.T_target_source
-    start = datasets.disturbed(T, pair.points, datasets.rng_of("a"))
+    start = disturbed(T, pair.points, rng_of("a"))
     assert metrics.rotation_error_deg(start, T) == pytest.approx(1.0)
     assert metrics.error_3d_m(start, T, pair.points) == pytest.approx(0.12, abs=0.005)
     centre = pair.points.mean(0)
     assert np.linalg.norm(transform(start, centre) - transform(T, centre)) == pytest.approx(0.12)
-    np.testing.assert_array_equal(start, datasets.disturbed(T, pair.points, datasets.rng_of("a")))
-    assert np.abs(start - datasets.disturbed(T, pair.points, datasets.rng_of("b"))).max() > 0.01
+    np.testing.assert_array_equal(start, disturbed(T, pair.points, rng_of("a")))
+    assert np.abs(start - disturbed(T, pair.points, rng_of("b"))).max() > 0.01
 
 
 def test_disturbed_prior_is_honest(pair):
     values = []
     for seed in range(20):
-        prior = datasets.disturbed_prior(pair, seed)
+        prior = disturbed_prior(pair, seed)
         values.append(metrics.nees(prior.T_target_source, prior.covariance, pair.T_target_source))
     # Both parts have exactly the size that their sigmas say: 3 + 3.
     np.testing.assert_allclose(values, 6, atol=0.05)
@@ -152,7 +156,7 @@ def test_summary_counts_failures(capsys):
     off = {**good, "e_trans_m": 0.5, "status": "converged", "nees": 100.0}
     names = {"set": "s", "start": "disturbed", "method": "m"}
     rows = [{**names, "category": c, **r} for c, r in (("small", good), ("large", bad), ("large", off))]
-    lines = {line["category"]: line for line in tables.summarise(rows)}
+    lines = {line["category"]: line for line in summary.summarise(rows)}
     assert (lines["all"]["p90_e_3d_m"], lines["all"]["map_free"]) == (np.inf, pytest.approx(1 / 3))
     assert lines["small"]["p90_e_3d_m"] == 0.02
     assert list(lines) == ["small", "large", "all"]
@@ -162,24 +166,24 @@ def test_summary_counts_failures(capsys):
     assert lines["large"]["e_trans_m"] == np.inf
     assert lines["all"]["mean_e_trans_m"] == pytest.approx(0.255)
     assert (lines["all"]["nees_95"], lines["all"]["wrong_ok"]) == (0, pytest.approx(1 / 3))
-    assert "| all | m | 2/3 | 0.5000 |" in tables.markdown(rows, {"cpu": "x"})
+    assert "| all | m | 2/3 | 0.5000 |" in run_tables.markdown(rows, {"cpu": "x"})
 
 
 def test_written_rows_can_be_read_again(tmp_path):
     row = {"set": "s", "start": "d", "category": "small", "method": "m", "found": False, "seconds": 0.1}
-    tables.write(tmp_path, [{**row, **dict.fromkeys(("e_trans_m", "e_rot_deg", "e_3d_m"), np.inf)}], {"cores": 2})
+    run_tables.write(tmp_path, [{**row, **dict.fromkeys(("e_trans_m", "e_rot_deg", "e_3d_m"), np.inf)}], {"cores": 2})
     assert {path.name for path in tmp_path.iterdir()} == {"rows.csv", "run.json", "table.md"}
     assert "Infinity" not in (tmp_path / "run.json").read_text()
 
 
-@pytest.mark.parametrize("name", datasets.RGBD_SETS)
+@pytest.mark.parametrize("name", RGBD_SETS)
 def test_data_set_loads(name):
-    if name not in datasets.available():
+    if name not in available():
         pytest.skip(f"{name} is not at ../shared/data")
-    (pair,) = datasets.load_pairs(name, limit=1)
+    (pair,) = load_pairs(name, limit=1)
     assert pair.category in ("small", "large")
     assert np.nanmedian(pair.source.depth) == pytest.approx(2.5, abs=2)
-    spoilt = datasets.with_monocular_depth(pair)
+    spoilt = with_monocular_depth(pair)
     assert np.array_equal(np.isnan(spoilt.source.depth), np.isnan(pair.source.depth))
     assert not np.array_equal(spoilt.source.depth, pair.source.depth, equal_nan=True)
     assert spoilt.points is pair.points

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generated pairs with hardly anything to match: plain rooms in the dark, seen by a robot that moves.
 
-    python -m bench.pairs.bare --out out/bare_rooms
+    python -m bench.pairs.bare_rooms --out out/bare_rooms
 
 A room of texture 0 (`bench.rooms`) still has lamps, edges and shadows. What a camera on a moving robot makes of them in
 a dim room is simulated from linear light on: less light, motion blur along one direction, shot and read noise
@@ -16,15 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.pairs.datasets import Pair, scene_points
+from bench.pairs.pair import Pair, scene_points
 from bench.rooms import RoomPair, make_pair
+from bench.rooms.dark import BLUR_PX, EXPOSURE, GAMMA, READ_ELECTRONS, WHITE_ELECTRONS, in_the_dark
 from garps_core import Config, View
 from garps_core.start.features import match_features
 
@@ -32,21 +32,13 @@ SET = "bare_rooms"
 FOLDER = Path("out/bare_rooms")
 MAX_MATCHES = 30
 LEVELS = (1, 2, 3, 4)
-EXPOSURE = 0.3
-"""Share of the light of a well exposed image: the shutter is at its limit."""
-BLUR_PX = 8.0
-"""Length of the motion blur at 640 px width: a turn of about 0.4 rad/s over 1/30 s."""
-WHITE_ELECTRONS = 150.0
-"""Photons counted at white: a small sensor at a high gain."""
-READ_ELECTRONS = 2.0
-GAMMA = 2.2
 VERSION = 1
 VIEW_ARRAYS = ("rgb", "K", "depth")
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which seeds a split may take, and how many pairs of each level it keeps."""
+    """Seeds that a split may take, and the number of pairs of each level that it keeps."""
 
     seeds: range
     per_level: int
@@ -63,23 +55,6 @@ SPLITS = {"tune": Split(range(100), 4), "report": Split(range(2000, 2400), 12)}
 def candidates(split: Split) -> Iterator[tuple[int, int]]:
     """(seed, level) in the order in which they are tried: levels take turns, a seed is used once."""
     return ((seed, LEVELS[seed % len(LEVELS)]) for seed in split.seeds)
-
-
-def in_the_dark(rgb: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """HxWx3 uint8 -> the same scene, taken with less light by a moving camera."""
-    light: npt.NDArray[Any] = (rgb / 255.0) ** GAMMA * EXPOSURE
-    light = cv2.filter2D(light, -1, _streak(BLUR_PX * rgb.shape[1] / 640, rng), borderType=cv2.BORDER_REFLECT)
-    electrons = rng.poisson(light * WHITE_ELECTRONS) + rng.normal(0, READ_ELECTRONS, light.shape)
-    return np.rint(255 * np.clip(electrons / WHITE_ELECTRONS, 0, 1) ** (1 / GAMMA)).astype(np.uint8)
-
-
-def _streak(length_px: float, rng: np.random.Generator) -> npt.NDArray[np.float32]:
-    """Kernel of a straight motion in a random direction."""
-    angle, reach = rng.uniform(0, np.pi), int(np.ceil(length_px / 2))
-    end = np.rint(np.array([np.cos(angle), np.sin(angle)]) * length_px / 2).astype(int)
-    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
-    cv2.line(kernel, (reach - end).tolist(), (reach + end).tolist(), 1.0)
-    return np.asarray(kernel / kernel.sum(), np.float32)
 
 
 def room_pair(seed: int, level: int, width: int = 640, height: int = 480) -> Pair:
@@ -161,7 +136,7 @@ def load(
 
 
 def _recipe(width: int, height: int) -> str:
-    """What decides about a pair besides its seed and level; change `VERSION` with the rooms themselves."""
+    """All that decides about a pair besides its seed and level; change `VERSION` with the rooms themselves."""
     settings = (VERSION, MAX_MATCHES, EXPOSURE, BLUR_PX, WHITE_ELECTRONS, READ_ELECTRONS, GAMMA, width, height)
     return " ".join(map(str, settings))
 

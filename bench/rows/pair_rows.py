@@ -9,11 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, disturbed_prior, truth_covariance
-from bench.peers.baselines import METHODS
-from bench.rows.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, estimate
-from bench.scoring.scores import camera_error_m, vcre_px
-from bench.scoring.tables import ERRORS, START, Row
+from bench.pairs.pair import Pair
+from bench.pairs.readers.pairs_json import truth_covariance
+from bench.pairs.starts import disturbed_prior
+from bench.peers.methods import METHODS
+from bench.rows.pose_errors import camera_error_m, vcre_px
+from bench.rows.row import ERRORS, START, Row
+from bench.rows.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, variant_estimate
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 from garps_core.start.initialise import identity
@@ -23,7 +25,7 @@ STARTS = ("features", "disturbed", "identity", "none")
 fit, and peers that need a start from the identity."""
 
 
-def evaluate(
+def rows_of_pairs(
     config: Config,
     pairs: Sequence[Pair],
     start: str = "disturbed",
@@ -36,16 +38,16 @@ def evaluate(
         config: settings of GARPS; its `start.method` is set here.
         pairs: what `load_pairs` gave; keep the list to evaluate many configurations.
         start: one of `STARTS`.
-        methods: names from `bench.rows.variants.VARIANTS` and `bench.peers.baselines.METHODS`. GARPS always runs where
+        methods: names from `bench.rows.variants.VARIANTS` and `bench.peers.methods.METHODS`. GARPS always runs where
             the start comes from it.
         seed: of the disturbance.
     Returns: rows, per pair first "(start)", then the methods in order.
     """
     chosen = list(methods)
-    return [row for pair in pairs for row in evaluate_pair(config, pair, start, chosen, seed)]
+    return [row for pair in pairs for row in rows_of_pair(config, pair, start, chosen, seed)]
 
 
-def evaluate_pair(
+def rows_of_pair(
     config: Config,
     pair: Pair,
     start: str,
@@ -53,40 +55,40 @@ def evaluate_pair(
     seed: int = 0,
     known: Mapping[str, Row] | None = None,
 ) -> list[Row]:
-    """`evaluate` on one pair; peers in `known` are not run, their rows are taken from there.
+    """`rows_of_pairs` on one pair; peers in `known` are not run, their rows are taken from there.
 
     `garps-no-features` is left out where no pose is given to start from, and `garps-labels` where there are none.
     """
-    look = _Look(config, pair, start, seed)
-    prior, own = look.prior, None
+    case = _Case(config, pair, start, seed)
+    prior, own = case.prior, None
     if GARPS in methods or prior is None:
         own = run_garps(config, pair, start, prior)
-    initial = prior if prior is not None or own is None else own[0].initial
-    rows = [_start_row(look, initial, None if prior is not None or own is None else own[0])]
-    T_start = None if initial is None else initial.T_target_source
+    start_pose = prior if prior is not None or own is None else own[0].initial
+    rows = [_start_row(case, start_pose, None if prior is not None or own is None else own[0])]
+    T_start = None if start_pose is None else start_pose.T_target_source
     for name in methods:
         if name == GARPS and own is not None:
-            rows.append(_garps_row(look, GARPS, *own))
+            rows.append(_garps_row(case, GARPS, *own))
         elif name in VARIANTS:
             left_out = (name == GARPS_NO_FEATURES and prior is None) or (VARIANTS[name].labels and pair.labels is None)
-            rows += [] if left_out else [_garps_row(look, name, *_timed(VARIANTS[name], look))]
+            rows += [] if left_out else [_garps_row(case, name, *_timed(VARIANTS[name], case))]
         elif known and name in known:
             rows.append(known[name])
         else:
             began = time.perf_counter()
             T, reason = METHODS[name](pair.source, pair.target, np.eye(4) if start == "none" else T_start)
-            rows.append(_row(look, name, T, time.perf_counter() - began, reason))
+            rows.append(_row(case, name, T, time.perf_counter() - began, reason))
     return rows
 
 
-def failed_pair(config: Config, pair: Pair, start: str, methods: Sequence[str], reason: str) -> list[Row]:
-    """The rows of `evaluate_pair` on a pair that cannot be had, for instance for want of depth: all are failures."""
-    look = _Look(config, pair, start, 0)
-    return [_row(look, name, None, float("nan"), reason) for name in (START, *methods)]
+def failed_rows(config: Config, pair: Pair, start: str, methods: Sequence[str], reason: str) -> list[Row]:
+    """The rows of `rows_of_pair` on a pair that cannot be had, for instance for want of depth: all are failures."""
+    case = _Case(config, pair, start, 0)
+    return [_row(case, name, None, float("nan"), reason) for name in (START, *methods)]
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Case:
     """A pair from one kind of start."""
 
     config: Config
@@ -102,9 +104,9 @@ class _Look:
         return identity(self.config, "a guess") if self.start == "identity" else None
 
 
-def _timed(variant: Variant, look: _Look) -> tuple[PoseEstimate, float]:
+def _timed(variant: Variant, case: _Case) -> tuple[PoseEstimate, float]:
     began = time.perf_counter()
-    found = estimate(variant, look.pair, _started(look.config, look.start), look.prior)
+    found = variant_estimate(variant, case.pair, _started(case.config, case.start), case.prior)
     return found, time.perf_counter() - began
 
 
@@ -122,16 +124,16 @@ def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tu
     return found, time.perf_counter() - began
 
 
-def _start_row(look: _Look, initial: Prior | None, own: PoseEstimate | None) -> Row:
+def _start_row(case: _Case, start_pose: Prior | None, own: PoseEstimate | None) -> Row:
     """The pose before the alignment; `own` = GARPS' estimate where it chose the pose itself."""
     seconds = float("nan") if own is None else own.seconds.get("initialise", float("nan"))
-    if initial is None:
-        return _row(look, START, None, seconds, "" if own is None else own.reason)
-    return _row(look, START, initial.T_target_source, seconds, "", initial.covariance)
+    if start_pose is None:
+        return _row(case, START, None, seconds, "" if own is None else own.reason)
+    return _row(case, START, start_pose.T_target_source, seconds, "", start_pose.covariance)
 
 
-def _garps_row(look: _Look, name: str, found: PoseEstimate, seconds: float) -> Row:
-    row = _row(look, name, found.T_target_source, seconds, found.reason, found.covariance)
+def _garps_row(case: _Case, name: str, found: PoseEstimate, seconds: float) -> Row:
+    row = _row(case, name, found.T_target_source, seconds, found.reason, found.covariance)
     return row | {
         "status": found.status.value,
         "origin": "" if found.initial is None else found.initial.origin,
@@ -144,15 +146,15 @@ def _garps_row(look: _Look, name: str, found: PoseEstimate, seconds: float) -> R
 
 
 def _row(
-    look: _Look,
+    case: _Case,
     method: str,
     T: Float64Array | None,
     seconds: float,
     reason: str,
     covariance: Float64Array | None = None,
 ) -> Row:
-    pair, truth = look.pair, look.pair.T_target_source
-    row: Row = {"set": pair.set, "pair": pair.id, "category": pair.category, "start": look.start, "method": method}
+    pair, truth = case.pair, case.pair.T_target_source
+    row: Row = {"set": pair.set, "pair": pair.id, "category": pair.category, "start": case.start, "method": method}
     row |= {"found": T is not None, "seconds": seconds, "reason": reason, "scale": pair.scale}
     row |= {
         "points": len(pair.points),

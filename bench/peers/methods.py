@@ -4,7 +4,7 @@
 `method(source, target, T_start) -> Result`: two RGB-D views and a 4x4 start pose (or None) to a 4x4 pose or the reason
 why there is none. A method never raises on data. Every call starts from the images, so its wall time is honest. Those
 that work on clouds share one kind of clouds, those that work on matches the same matches; COLMAP makes its own. Each
-peer got the settings that served it best on the pairs of `bench.pairs.datasets`, but `colmap` and `cpd`, which have the
+peer got the settings that served it best on the recorded RGB-D pairs, but `colmap` and `cpd`, which have the
 usual ones.
 """
 
@@ -38,7 +38,7 @@ class Result(NamedTuple):
 
 Method = Callable[[View, View, Float64Array | None], Result]
 NO_ANSWER = (Failure, GarpsError, RuntimeError, ValueError, np.linalg.LinAlgError, cv2.error, ModuleNotFoundError)
-"""What methods raise on pairs that they can do nothing with, or where their library is not installed."""
+"""Exceptions of methods on pairs that they can do nothing with, or where their library is not installed."""
 FROM_A_START: dict[str, Callable[[View, View, Float64Array], Float64Array]] = {
     "open3d-gicp": registration.open3d_gicp,
     "open3d-colored": registration.open3d_colored,

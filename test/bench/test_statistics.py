@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.scoring.statistics_blocks import (
+from bench.scoring.statistics import (
     all_pairs,
     common_subset,
     errors_of,

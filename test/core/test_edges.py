@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from garps_core.mixtures.edges import away_from_edges, one_surface
+from garps_core.edges import away_from_edges, one_surface
 
 
 def written_out(depth, ratio):
