@@ -25,11 +25,13 @@ import typer
 from rich.console import Console
 
 from bench.pairs import learned_rooms
-from bench.pairs.datasets import DATA, Pair, available, disturbed_prior, load_pairs, spread
-from bench.pairs.sources import DEMO_NET, config_of, with_depth_of
-from bench.scoring.depth_errors import depth_errors
+from bench.pairs.depths import DEMO_NET, config_of, with_depth_of
+from bench.pairs.pair import Pair, spread
+from bench.pairs.readers.pairs_json import DATA, available, load_pairs
+from bench.pairs.starts import disturbed_prior
+from bench.rows.depth_errors import depth_errors
 from garps_core import Config, estimate_relative_pose, metrics
-from garps_core.models.demo_net import DemoNet, depth_of, shipped
+from garps_core.models.demo_net import DemoNet, depth_of_views, shipped
 from garps_core.types import View
 
 PICTURES = 4
@@ -42,7 +44,7 @@ def depth_rows(pairs: Sequence[Pair], network: DemoNet) -> list[str]:
     for name in dict.fromkeys(pair.set for pair in pairs):
         errors, sensor, ours = [], [], []
         for view in (view for pair in pairs if pair.set == name for view in (pair.source, pair.target)):
-            (depth,) = depth_of(network, [view])
+            (depth,) = depth_of_views(network, [view])
             errors.append(depth_errors(depth, _sensor(view)))
             sensor.append(float(np.nanmedian(_sensor(view))))
             ours.append(float(np.median(depth)))
@@ -90,7 +92,7 @@ def picture(pairs: Sequence[Pair], network: DemoNet) -> npt.NDArray[np.uint8]:
     """A row per pair: photograph, true or sensor's depth, the network's, on one scale of colours; BGR."""
     rows = []
     for pair in spread(list(pairs), PICTURES):
-        (ours,) = depth_of(network, [pair.source])
+        (ours,) = depth_of_views(network, [pair.source])
         top = float(np.nanquantile(_sensor(pair.source), 0.98)) * 1.2
         panels = [pair.source.rgb[..., ::-1], *(coloured(depth, top) for depth in (_sensor(pair.source), ours))]
         rows.append(np.hstack([cv2.resize(panel, (320, 240), interpolation=cv2.INTER_AREA) for panel in panels]))
@@ -115,7 +117,8 @@ def time_line(views: Sequence[View], network: DemoNet) -> str:
     with ThreadPoolExecutor(2) as pool:  # as GARPS does it
         turns = range(RUNS + 3)
         both = [
-            (_seconds(lambda: depth_of(network, views)), _seconds(lambda: list(pool.map(detect, greys)))) for _ in turns
+            (_seconds(lambda: depth_of_views(network, views)), _seconds(lambda: list(pool.map(detect, greys))))
+            for _ in turns
         ]
     spent = both[3:]
     network_s, sift_s = (statistics.median(one) for one in zip(*spent, strict=True))
@@ -134,7 +137,7 @@ def _seconds(what: Callable[[], Any]) -> float:
 
 def main(
     data: Annotated[Path, typer.Option(help="folder that holds dev/<set>/pairs.json")] = DATA,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set")] = None,
+    limit: Annotated[int | None, typer.Option(help="largest number of pairs of a set")] = None,
     rooms: Annotated[Path, typer.Option(help="folder of the generated pairs, for the time")] = learned_rooms.FOLDER,
     out: Annotated[Path, typer.Option(help="folder of table and pictures")] = Path("out/learned_photos"),
 ) -> None:

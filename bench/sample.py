@@ -21,12 +21,13 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from bench.pairs.depths import DEPTHS, MONOCULAR, SENSOR
 from bench.pairs.readers import realestate10k as re10k
-from bench.pairs.readers.files import image
+from bench.pairs.readers.dataset_files import image
 from bench.pairs.readers.pair_list import RAW
 from bench.pairs.readers.sfm_scale import SOURCE
-from bench.pairs.sources import DEPTHS, MONOCULAR, SENSOR
 from garps_core import Config, GarpsError, View
+from garps_core.align import NETWORKS as SHARED
 from garps_core.mixtures.reconstruct import with_depth
 
 NETWORKS = tuple(name for name in DEPTHS if name not in (SENSOR, MONOCULAR))
@@ -73,7 +74,7 @@ def make_depth(folder: Path, clip: str, camera: re10k.Camera, network: str) -> N
     """Write the depth map of a frame: 16 bit, mm. Raises WeightsError where the network's weights are not installed."""
     rgb = image(re10k.frame_file(folder, clip, camera))
     config = Config.preset(DEPTHS[network]).replace({"reconstruction.method": network})
-    (view,) = with_depth([View(rgb, camera.K(*rgb.shape[1::-1]))], config)
+    (view,) = with_depth([View(rgb, camera.K(*rgb.shape[1::-1]))], config, SHARED)
     assert view.depth is not None
     path = re10k.depth_file(folder, clip, camera)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a two-view network costs on this machine's CPU, stage by stage, for one pair of pictures.
+"""Cost of a two-view network on this machine's CPU, stage by stage, for one pair of pictures.
 
     python -m bench.two_view [--size full|small] [--head mast3r|dust3r|linear] [--runs 3] [--threads 2]
 
@@ -20,11 +20,11 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.networks.__main__ import counted_flop
-from bench.networks.pair import peak_mib, seconds_of
-from bench.scoring.tables import machine_facts
-from bench.speed.parts import Check, Row, Section, markdown
-from garps_core.models.mast3r import NaverModel, prepared
+from bench.machine.cost import peak_mib, seconds_of
+from bench.machine.facts import machine_facts
+from bench.machine.flop import counted_flop
+from bench.report.checks import Check, Row, Section, markdown
+from garps_core.models.mast3r import NaverModel, cropped_input
 from garps_core.models.two_view import Architecture, Stack, TwoView
 
 Call = Callable[[], Any]
@@ -44,7 +44,7 @@ def random_network(architecture: Architecture) -> TwoView:
 
 def stages(network: TwoView, pictures: list[Any]) -> dict[str, Call]:
     """Name -> what it does, in order; every part of a pair by itself, then the whole."""
-    inputs, framings = zip(*map(prepared, pictures), strict=True)
+    inputs, framings = zip(*map(cropped_input, pictures), strict=True)
     batch = torch.stack(inputs)
     rows, columns = (side // 16 for side in framings[0].size)
     with torch.inference_mode():
@@ -60,7 +60,7 @@ def stages(network: TwoView, pictures: list[Any]) -> dict[str, Call]:
     for hook in hooks:
         hook.remove()
     return {
-        "prepare both pictures": lambda: [prepared(picture) for picture in pictures],
+        "prepare both pictures": lambda: [cropped_input(picture) for picture in pictures],
         "encode both": lambda: network.encode(batch),
         "decode both orders, with the heads": decode,
         "heads alone, both orders": lambda: [head(*args) for head, args in zip(heads, given, strict=True)],
@@ -77,7 +77,7 @@ def measured(name: str, call: Call, runs: int) -> Row:
 
 
 def counted(row: Row, call: Call) -> Row:
-    """The same line with its operations; counting them keeps intermediate results, so it comes after every peak."""
+    """A line with its operations; counting them keeps intermediate results, so it comes after every peak."""
     with torch.inference_mode():
         flop = counted_flop(call) / 1e9
     return row | {"GFLOP": flop, "GFLOP per CPU s": flop / row["CPU s"]}
@@ -107,7 +107,7 @@ def main(
     if count:
         lines = [counted(line, call) for line, call in zip(lines, parts.values(), strict=True)]
     parameters = sum(parameter.numel() for parameter in network.parameters()) / 1e6
-    inside = "x".join(map(str, prepared(pictures[0])[1].size))
+    inside = "x".join(map(str, cropped_input(pictures[0])[1].size))
     title = f"{head} {size}, {parameters:.1f} M parameters, 2 of {rows}x{columns} seen as {inside}, medians of {runs}"
     section = Section(title, [Check("CPU seconds of a whole pair", lines[-1]["CPU s"])], lines)
     out.mkdir(parents=True, exist_ok=True)

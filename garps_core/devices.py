@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
-import torch
+from typing import TypeVar
 
-from garps_core.errors import ConfigError
+import torch
+from torch import nn
+
+from garps_core.errors import ConfigError, ModelError
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def checked_device(name: str) -> torch.device:
@@ -21,3 +26,14 @@ def checked_device(name: str) -> torch.device:
     raise ConfigError(
         f"device is {name!r}, which is not there: expected one of {', '.join(there)}; set device to 'cpu'"
     )
+
+
+def on_device(network: Network, device: str) -> Network:
+    """The network, moved there. Raises ConfigError for a device that is not there, ModelError where it does not fit."""
+    try:
+        return network.to(checked_device(device))
+    except torch.cuda.OutOfMemoryError as error:
+        raise ModelError(
+            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit; free some, "
+            f"choose a smaller network, or use the CPU ({error})"
+        ) from None

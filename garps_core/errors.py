@@ -18,6 +18,10 @@ class ReconstructionError(GarpsError):
     """A view that is well formed but holds too little depth to become a mixture."""
 
 
+class MissingDepthError(ReconstructionError):
+    """A view comes without any depth image where a sensor's is wanted: a mistake of the caller, not of the scene."""
+
+
 class InitialisationError(GarpsError):
     """No initial pose: too few feature matches fit one pose and no other start is allowed."""
 

@@ -133,7 +133,7 @@ class Status(enum.Enum):
     INCONSISTENT = "inconsistent"  #: the data pulls further from the initial pose than its covariance allows
     POOR_FIT = "poor_fit"  #: too few partners, or brightness disagrees: most likely a wrong optimum; a pose is given
     LOW_OVERLAP = "low_overlap"  #: too few components of one view are visible in the other
-    NO_MIXTURE = "no_mixture"  #: a network could not do its part: too little memory, or values that are not finite
+    NO_MIXTURE = "no_mixture"  #: a view has too little usable depth, or a network failed: no memory, values not finite
     NO_INITIAL_POSE = "no_initial_pose"  #: nothing to start from
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the networks cost on this machine's CPU, and how close they come to its own matrix multiplication.
+"""Cost of the networks on this machine's CPU, and how close they come to its own matrix multiplication.
 
     python -m bench.networks [--only depth-anything,flash3d] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
 
@@ -23,15 +23,15 @@ import numpy as np
 import torch
 import typer
 from rich.console import Console
-from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from bench.networks.pair import pair_lines, peak_mib, seconds_of
-from bench.scoring.tables import machine_facts
-from bench.speed.parts import Check, Row, Section, markdown, print_section
+from bench.machine.cost import peak_mib, seconds_of
+from bench.machine.facts import machine_facts
+from bench.machine.flop import Call, counted_flop
+from bench.networks.pair import pair_lines
+from bench.report.checks import Check, Row, Section, markdown, print_section
 
-Call = Callable[[], Any]
 BAR_SHARE = 0.5
-"""Of the multiplication's throughput: the least that the default depth network must reach on two images."""
+"""Least share of the multiplication's throughput that the default depth network must reach on two images."""
 MATRIX = 2048
 """Rows and columns of the multiplied matrices."""
 MULTIPLICATIONS = 4
@@ -40,7 +40,7 @@ MULTIPLICATIONS = 4
 
 @dataclass(frozen=True)
 class Case:
-    """One line of the table: a network of one size on so many images of one size."""
+    """One line of the table: a network of one size on images of one size."""
 
     network: str
     size: str
@@ -57,12 +57,12 @@ class Case:
 
 def depth_anything(case: Case) -> tuple[Call, str]:
     """Depth Anything V2, and the size its images get."""
-    from garps_core.models.depth_anything import DepthAnythingV2, built_from, depth_of, network_size
+    from garps_core.models.depth_anything import DepthAnythingV2, built_from, depth_of_images, network_size
 
     model = built_from(DepthAnythingV2(case.size, 20.0).state_dict(), max_depth=20.0)
     pictures = case.pictures()
     rows, columns = network_size(pictures[0])
-    return lambda: depth_of(model, pictures), f"{rows}x{columns}"
+    return lambda: depth_of_images(model, pictures), f"{rows}x{columns}"
 
 
 def flash3d(case: Case) -> tuple[Call, str]:
@@ -80,11 +80,11 @@ def flash3d(case: Case) -> tuple[Call, str]:
 
 def labels_by_dinov2(case: Case) -> tuple[Call, str]:
     """DINOv2 with the linear ADE20K head; one image at a time, each as large as it is."""
-    from garps_core.models.semantics import Segmenter, prepared, segment
+    from garps_core.models.semantics import Segmenter, padded_input, segment
 
     network = Segmenter(case.size, last_blocks=1, classes=150).eval().requires_grad_(False)
     pictures = case.pictures()
-    rows, columns = prepared(pictures[0]).shape[-2:]
+    rows, columns = padded_input(pictures[0]).shape[-2:]
     return lambda: [segment(network, picture) for picture in pictures], f"{rows}x{columns}"
 
 
@@ -125,18 +125,6 @@ def measured(case: Case, runs: int, threads: int) -> Row:
     images = f"{case.images} of {case.rows}x{case.columns}"
     names = {"network": f"{case.network} {case.size}".strip(), "images": images, "inside": inside}
     return names | told | {"peak MiB": peak, "beyond imports MiB": peak - imported, "GFLOP": flop / 1e9}
-
-
-def counted_flop(call: Call) -> int:
-    """Floating-point operations of matrix products, convolutions and attention in a call; a multiply-add is two."""
-    attention = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flop}
-    with FlopCounterMode(display=False, custom_mapping=attention) as counter:
-        call()
-    return int(counter.get_total_flops())
-
-
-def _attention_flop(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    return int(sdpa_flop_count(query, key, value))
 
 
 def _round(call: Call, flop: int) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from bench.peers.features_pnp import Failure
 from garps_core import Config
+from garps_core.align import NETWORKS
 from garps_core.checks import Float64Array
 from garps_core.errors import WeightsError
 from garps_core.start.initialise import initialise
@@ -22,9 +23,9 @@ def dust3r(source: View, target: View) -> Float64Array:
 
 
 def _pose(source: View, target: View, network: str) -> Float64Array:
-    """The network's pose. It remembers the last pair: asked right after GARPS about the same, it takes no time."""
+    """The network's pose. It keeps the tokens of the last pictures: asked after GARPS, it only decodes."""
     try:
-        (start,) = initialise(source, target, Config().replace({"start.method": network}))
+        (start,) = initialise(source, target, Config().replace({"start.method": network}), networks=NETWORKS)
     except WeightsError as error:
         raise Failure(f"weights are not installed: {error}") from None
     return start.T_target_source

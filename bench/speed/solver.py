@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.peers.autograd import PlainObjective
-from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import to_device
-from garps_core.objective.shape import Pairs, evaluate, unpack
+from garps_core.objective.shape import Pairs, evaluate
 from garps_core.objective.state import State, WeightedStart
 from garps_core.solver import ladder, paper
 from garps_core.solver.problem import Problem
@@ -34,7 +36,7 @@ SAME_STEPS = 100
 
 @dataclass(frozen=True)
 class Contest:
-    """The same components for both: only the weights are each preset's own (area seen; one per component)."""
+    """Both solvers with equal components: only the weights are each preset's own (area seen; one per component)."""
 
     mixtures: dict[str, tuple[Mixture, Mixture]]
     configs: dict[str, Config]
@@ -48,7 +50,7 @@ class Contest:
         return estimate
 
     def paper_pairs(self) -> Pairs:
-        """What the paper's solver works on. Raises RuntimeError when too little is left."""
+        """Pairs of the paper's solver. Raises RuntimeError when too few are left."""
         config = self.configs[PAPER]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[PAPER])
         pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.paper)
@@ -72,7 +74,7 @@ class Contest:
         return paper.adam_path(self.paper_pairs(), self.prior.T_target_source, settings, settings.steps)[-1]
 
     def rung_pairs(self, rung: Rung, T: Float64Array) -> tuple[Pairs, Pairs]:
-        """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
+        """Pairs of the default solver at pose T in one rung. Raises RuntimeError when too few are left."""
         config = self.configs[DEFAULT]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[DEFAULT])
         with ThreadPoolExecutor(1) as pool:
@@ -193,7 +195,7 @@ def autograd_section(inputs: Inputs, steps: int | None = None) -> Section:
 
 
 def plain(pairs: Pairs) -> PlainObjective:
-    """The same candidate pairs, gathered one by one, for the reference."""
+    """Candidate pairs gathered one by one, for the reference."""
     k, n = pairs.log_weights.shape
     weights = (pairs.log_weights.exp() * pairs.weights).reshape(k * n)
     kept = weights > 0

@@ -17,7 +17,7 @@ import typer
 from torch import Tensor
 
 from bench.training.rooms import VERSION
-from garps_core.models.demo_net import HEIGHT, WIDTH, prepared
+from garps_core.models.demo_net import HEIGHT, WIDTH, demo_input
 
 BATCH = 16
 SMALLEST_CROP = 0.65
@@ -94,7 +94,7 @@ def recoloured(rgb: Picture, rng: np.random.Generator) -> Picture:
 
 
 def _sample(rgb: Picture, depth_mm: npt.NDArray[np.uint16], K: npt.NDArray[np.float64]) -> Sample:
-    seen, focal = prepared(np.ascontiguousarray(rgb), K)
+    seen, focal = demo_input(np.ascontiguousarray(rgb), K)
     return Sample(seen, np.log(shrunk(depth_mm) / np.float32(focal)), focal)
 
 

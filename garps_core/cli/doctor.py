@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this machine has, for a bug report: versions, devices, memory, and one tiny alignment."""
+"""The state of this machine for a bug report: versions, devices, memory, and one tiny alignment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 from garps_core.align import align_mixtures
 from garps_core.checks import Float64Array
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
-from garps_core.models.demo_net import WHAT_IT_IS
+from garps_core.models.depth_networks import listed
 from garps_core.types import Mixture, Prior
 from garps_core.weights.manifest import ALL
 from garps_core.weights.store import installed, weights_folder
@@ -32,7 +32,7 @@ DISTRIBUTIONS = {"cv2": ("opencv-python-headless", "opencv-python", "opencv-cont
 
 
 def examine() -> tuple[list[tuple[str, str]], bool]:
-    """Rows (name, finding) for people, and whether everything that is needed works."""
+    """Return rows (name, result) for people, and whether everything that is needed works."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}"), ("garps", version_of("garps_ros"))]
     missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
     rows += [(name, "MISSING: install it" if name in missing else version_of(name)) for name in REQUIRED]
@@ -41,7 +41,7 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
         rows.append((name, version_of(name) if found else f"not installed ({purpose})"))
     rows += [
         ("weights", weights()),
-        ("demo_net", f"in the package; {WHAT_IT_IS}"),
+        *listed(),
         ("devices", devices()),
         ("threads", f"{torch.get_num_threads()} of {os.cpu_count()}"),
         ("memory", memory()),

@@ -118,7 +118,7 @@ def convert(
 
 @app.command()
 def check(file: File, variant: Variant = "", kind: Kind = None) -> int:
-    """Is this file what it should be?
+    """Check whether a weights file is plausible.
 
     Looks at all tensors and sends one drawn picture through the network.
 
@@ -128,7 +128,7 @@ def check(file: File, variant: Variant = "", kind: Kind = None) -> int:
     from garps_core.models.check import check_file
 
     healthy = True
-    for name, finding, good in check_file(file, variant=variant, kind=kind):
+    for name, result, good in check_file(file, variant=variant, kind=kind):
         healthy = healthy and good
-        print(f"{name:<11} {finding}" + ("" if good else "   <- NOT PLAUSIBLE"))
+        print(f"{name:<11} {result}" + ("" if good else "   <- NOT PLAUSIBLE"))
     return 0 if healthy else 1

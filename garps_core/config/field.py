@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a setting is: a field that knows its meaning, unit and range, and a dataclass that checks its own fields."""
+"""A setting is a field that knows its meaning, unit and range; a class of settings checks its own fields."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field
 from typing import Any, ClassVar
 
 from garps_core.errors import ConfigError
+
+Choices = tuple[str, ...] | Callable[[], tuple[str, ...]]
+"""The words a text setting may take, or a function that returns them, for words that depend on what is installed."""
 
 
 def setting(
@@ -19,24 +22,40 @@ def setting(
     unit: str = "",
     low: float | None = None,
     high: float | None = None,
-    choices: tuple[str, ...] = (),
+    choices: Choices = (),
     live: bool = True,
+    expert: bool = False,
 ) -> Any:
-    """A dataclass field with its meaning, unit and allowed values, from which help and parameters are generated.
+    """Return a dataclass field with its meaning, unit and allowed values; help and parameters are generated from it.
 
-    `live` = it may be changed while a node runs.
+    Args:
+        default: value in the preset `default`; its type is the type of the setting.
+        doc: meaning, complete in itself, as `ros2 param describe` prints it.
+        unit: unit of a number, "" = none.
+        low: smallest value of a number.
+        high: largest value of a number.
+        choices: the words a text may take, or a function that returns them; a function is called whenever they are
+            needed, never at import.
+        live: the setting may be changed while a node runs.
+        expert: only somebody who tunes the algorithm needs the setting; it is no parameter of a node.
     """
-    described = {"doc": doc, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
-    return field(default=default, metadata=described)
+    limits = {"unit": unit, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata={"doc": doc, **limits, "live": live, "expert": expert})
+
+
+def description(f: dataclasses.Field[Any]) -> dict[str, Any]:
+    """Return the arguments `setting` was called with for this field, `choices` as a tuple."""
+    choices = f.metadata.get("choices", ())
+    return {**f.metadata, "choices": choices() if callable(choices) else choices}
 
 
 _KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
 
 
 class Checked:
-    """Base of a settings dataclass: checks every field against its own description, raises ConfigError.
+    """Base of a dataclass of settings, which checks every field against its description and raises ConfigError.
 
-    Errors name a field with `prefix` before it: by default the class in lower case and a dot.
+    Errors name a field with `prefix` before it, by default the name of the class in lower case and a dot.
     """
 
     _prefix: ClassVar[str]
@@ -47,9 +66,12 @@ class Checked:
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, limits = getattr(self, f.name), f.metadata
+            value = getattr(self, f.name)
+            if type(value) is type(f.default) and value == f.default:
+                continue  # choices that depend on what is installed are not looked up at import
+            limits = description(f)
             name = self._prefix + f.name
-            if limits.get("choices") and value not in limits["choices"]:
+            if limits["choices"] and value not in limits["choices"]:
                 raise ConfigError(f"{name} is {value!r}: expected one of {', '.join(limits['choices'])}")
             if isinstance(f.default, (int, float)) and not isinstance(f.default, bool):
                 _check_number(name, value, f.default, limits)
@@ -69,7 +91,7 @@ def _check_number(name: str, value: Any, default: float, limits: Mapping[str, An
 
 
 def flattened(prefix: str, part: Any) -> list[tuple[str, Any]]:
-    """Every setting of a dataclass of settings, and of those inside it, by dotted name, in order of definition."""
+    """Return every setting of a dataclass, and of those inside it, by dotted name in order of definition."""
     rows: list[tuple[str, Any]] = []
     for f in dataclasses.fields(part):
         value = getattr(part, f.name)
@@ -79,12 +101,23 @@ def flattened(prefix: str, part: Any) -> list[tuple[str, Any]]:
 
 
 def replaced(part: Any, name: str, path: list[str], value: Any, whole: Any = None) -> Any:
-    """A copy of `part` with the setting at `path` changed. Raises ConfigError, with a hint, where there is none."""
+    """Return a copy of `part` with the setting at `path` changed.
+
+    Args:
+        part: dataclass of settings.
+        name: dotted name as the user gave it, for errors.
+        path: names from `part` down to the setting.
+        value: its new value.
+        whole: settings among which the nearest name is looked for; `part` when None.
+
+    Raises:
+        ConfigError: no such setting, with the nearest name; or a value that is not allowed.
+    """
     whole = part if whole is None else whole
     names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
     if path[0] not in names:
         near = difflib.get_close_matches(name, [known for known, _ in flattened("", whole)], n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else "expected one of the names that Config().settings() lists"
+        hint = f"did you mean {near[0]!r}?" if near else "expected a name of docs/parameters.md"
         raise ConfigError(f"setting {name!r} does not exist; {hint}")
     if len(path) > 1:
         value = replaced(getattr(part, path[0]), name, path[1:], value, whole)

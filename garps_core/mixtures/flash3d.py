@@ -17,7 +17,7 @@ from torch import Tensor
 
 from garps_core.checks import Float32Array, Float64Array, IntArray
 from garps_core.config.lifting import Lifting
-from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError
+from garps_core.errors import ConfigError, InputError, MissingDepthError, ModelError, ReconstructionError
 from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.mixtures.splat_writer import SH_CONSTANT
 from garps_core.models.depth_anything import DTYPES
@@ -76,10 +76,11 @@ class Flash3DGaussians:
 def flash3d_input(view: View) -> Flash3DInput:
     """Bring a view with depth to the network's 256x384 pixels, whatever its aspect, and put a border around it.
 
-    Depth is read at the pixel that holds the centre (`nearest-exact`). Raises ReconstructionError without any depth.
+    Depth is read at the pixel that holds the centre (`nearest-exact`). Raises MissingDepthError
+    without a depth image, ReconstructionError where it has no reading.
     """
     if view.depth is None:
-        raise ReconstructionError("the view has no depth: Flash3D needs HxW float32 metres; run a depth network first")
+        raise MissingDepthError("the view has no depth: Flash3D needs HxW float32 metres; run a depth network first")
     height, width = view.depth.shape
     depth = view.depth[np.ix_(nearest_index(height, HEIGHT), nearest_index(width, WIDTH))]
     known = np.isfinite(depth)
@@ -213,7 +214,7 @@ def gaussians_to_mixture(
     """
     lifting = lifting or Lifting()
     if view.depth is None:
-        raise ReconstructionError("the view has no depth: expected the one that Flash3D was given")
+        raise MissingDepthError("the view has no depth: expected the one that Flash3D was given")
     z = gaussians.means[:, 2]
     usable = (z >= lifting.min_range_m) & (z <= lifting.max_range_m) & (gaussians.opacities >= MIN_OPACITY)
     kept = np.flatnonzero(usable)

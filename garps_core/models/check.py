@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Would anybody believe this weights file? Its tensors, and what its network says of one drawn picture.
+"""Plausibility of a weights file: its tensors, and the answer of its network to one drawn picture.
 
 No test of this repository can see the real weights, so the first person who has them gets a verdict here.
 """
@@ -19,21 +19,22 @@ from garps_core.weights.manifest import of_file, range_of
 from garps_core.weights.reader import Tensors, read_tensors
 from garps_core.weights.state_dict import check_finite, kind_of, load_strictly, recognised
 
-Finding = tuple[str, str, bool]
+Check = tuple[str, str, bool]
+"""Name, result in words, and whether it is plausible."""
 Picture = npt.NDArray[np.uint8]
 
 LOW_M = 0.2
-"""No depth network for rooms or streets says less of a whole room."""
+"""Smallest plausible depth of a whole room."""
 HIGH_M = 20.0
-"""Nor does any two-view network say more, in the median."""
+"""Largest plausible median depth by a two-view network."""
 SHIFT_PX = 16
-"""Between the two views that a two-view network is shown."""
+"""Shift between the two views that a two-view network is shown, right and down."""
 SATURATED = 0.98
 """Share of the largest depth beyond which nearly every pixel of a relative model's output lies."""
 
 
-def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Iterator[Finding]:
-    """Findings (name, words, whether it is good) in order, as they are made.
+def check_file(path: Path, *, variant: str = "", kind: str | None = None) -> Iterator[Check]:
+    """Yield the checks of a weights file in order, as they are made.
 
     Args:
         path: any weights file.
@@ -87,18 +88,18 @@ def drawn_room(height: int = 240, width: int = 320) -> tuple[Picture, Float32Arr
     return np.clip(rgb, 0, 255).astype(np.uint8), depth.astype(np.float32)
 
 
-def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Finding]:
-    from garps_core.models.depth_anything import built_from, depth_of
+def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Check]:
+    from garps_core.models.depth_anything import built_from, depth_of_images
 
     model = built_from(found.tensors, max_depth)
     yield "shapes", f"Depth Anything V2 of width {model.pretrained.cls_token.shape[-1]}", True
     picture, true = drawn_room()
-    (depth,) = depth_of(model, [picture])
+    (depth,) = depth_of_images(model, [picture])
     low, median, high = (float(x) for x in np.percentile(depth, (5, 50, 95)))
     words = f"{low:.2f} .. {median:.2f} .. {high:.2f} m (5, 50, 95 %)"
     yield "depth", words, low >= LOW_M and high <= SATURATED * max_depth
     likeness = _likeness(depth, true)
-    yield _likeness_finding(likeness, true)
+    yield _likeness_check(likeness, true)
     if likeness < -0.3 or median > SATURATED * max_depth:
         yield (
             "relative?",
@@ -113,13 +114,13 @@ def _likeness(depth: Float32Array, true: Float32Array) -> float:
     return float(np.corrcoef(*logs)[0, 1]) if logs[0].std() > 1e-5 else 0.0
 
 
-def _likeness_finding(likeness: float, true: Float32Array) -> Finding:
+def _likeness_check(likeness: float, true: Float32Array) -> Check:
     words = f"correlation {likeness:.2f} with the drawn room, {np.median(true):.2f} m deep in the median"
     return "likeness", words, likeness > 0
 
 
-def _two_view(found: Tensors, variant: str) -> Iterator[Finding]:
-    """From a part of the drawn room and another that is SHIFT_PX further right and down."""
+def _two_view(found: Tensors, variant: str) -> Iterator[Check]:
+    """Check a two-view network on a part of the drawn room and another that is SHIFT_PX further right and down."""
     from garps_core.models.mast3r import NaverModel
     from garps_core.models.two_view import built_from
 
@@ -136,15 +137,15 @@ def _two_view(found: Tensors, variant: str) -> Iterator[Finding]:
     yield "depth", words, LOW_M <= median <= HIGH_M if maps.metric else median > 0
     y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
     u, v = framing.to_image(np.stack([x.ravel(), y.ravel()], -1)).round().astype(int).clip(0, (319, 239)).T
-    yield _likeness_finding(_likeness(depth, room[v, u]), room[v, u])
+    yield _likeness_check(_likeness(depth, room[v, u]), room[v, u])
     least, middle = float(seen.confidence.min()), float(np.median(seen.confidence))
     yield "confidence", f"at least {least:.2f}, {middle:.2f} in the median", least >= 1 and middle > 1
     if maps.source_first[1].descriptors is not None and seen.descriptors is not None:
         yield _descriptors(seen.descriptors, maps.source_first[1].descriptors, framing.scale)
 
 
-def _descriptors(first: Float32Array, second: Float32Array, scale: tuple[float, float]) -> Finding:
-    """Are they unit vectors, and more alike where both views see the same?"""
+def _descriptors(first: Float32Array, second: Float32Array, scale: tuple[float, float]) -> Check:
+    """Check that descriptors are unit vectors, and more alike where both views see the same."""
     right, down = (round(SHIFT_PX * factor) for factor in scale)
     one, two = first[down:, right:], second[:-down, :-right]
     off = max(float(np.abs(np.linalg.norm(part, axis=-1) - 1).max()) for part in (one, two))
@@ -153,7 +154,7 @@ def _descriptors(first: Float32Array, second: Float32Array, scale: tuple[float, 
     return "descriptors", words, off < 1e-3 and same > others
 
 
-def _flash3d(found: Tensors) -> Iterator[Finding]:
+def _flash3d(found: Tensors) -> Iterator[Check]:
     from garps_core.models.flash3d import HEIGHT, PAD, WIDTH, flash3d_network, flash3d_tensors
 
     kept, left = flash3d_tensors(found.tensors)
@@ -173,7 +174,7 @@ def _flash3d(found: Tensors) -> Iterator[Finding]:
     yield "offsets", f"{1000 * offset:.1f} mm, median", offset < 1
 
 
-def _dinov2(found: Tensors) -> Iterator[Finding]:
+def _dinov2(found: Tensors) -> Iterator[Check]:
     from garps_core.models import vit
 
     tensors: Mapping[str, torch.Tensor] = found.tensors
@@ -187,7 +188,7 @@ def _dinov2(found: Tensors) -> Iterator[Finding]:
     yield "shapes", f"DINOv2 {size}", True
 
 
-def _head(found: Tensors) -> Iterator[Finding]:
+def _head(found: Tensors) -> Iterator[Check]:
     from garps_core.models.semantics import DecodeHead
 
     weight = found.tensors["decode_head.conv_seg.weight"]
@@ -201,7 +202,7 @@ def _head(found: Tensors) -> Iterator[Finding]:
     yield "shapes", f"a head on {channels} channels, {classes} classes (ADE20K has 150)", classes == 150
 
 
-def _m2f(found: Tensors) -> Iterator[Finding]:
+def _m2f(found: Tensors) -> Iterator[Check]:
     from garps_core.models.mask2former import mask2former_of
 
     mask2former_of(found.tensors)

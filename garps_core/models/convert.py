@@ -19,7 +19,7 @@ _SIZES = {384: "vits", 768: "vitb", 1024: "vitl", 1536: "vitg"}
 
 @dataclass(frozen=True)
 class Conversion:
-    """What was written: tensors kept, bytes, how many tensors were left out by the beginning of their names."""
+    """A written file: tensors kept, its bytes, the number of tensors left out by the start of their names."""
 
     kept: int
     bytes: int
@@ -45,7 +45,7 @@ def convert(source: Path, target: Path, *, variant: str = "", kind: str | None =
     found = read_tensors(source, kind=kind or (known.kind if known else None))
     told = kind_of(found.tensors) or (known.kind if known else "")
     if not told:
-        raise WeightsError(f"{source} holds {recognised(found.tensors)}: expected one of the networks that are known")
+        raise WeightsError(f"{source} holds {recognised(found.tensors)}: expected a network that GARPS knows")
     kept, left = needed(told, found.tensors)
     check_finite(kept, str(source))
     weights = _entry(source, told, kept, _checked_variant(source, told, variant, known))
@@ -54,7 +54,7 @@ def convert(source: Path, target: Path, *, variant: str = "", kind: str | None =
 
 
 def needed(kind: str, tensors: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], dict[str, int]]:
-    """The tensors that the network has, without aliases; of the others the count, by how their names begin."""
+    """Return the tensors that the network has, without aliases; count the others by the start of their names."""
     if kind == "flash3d":
         from garps_core.models.flash3d import flash3d_tensors
 

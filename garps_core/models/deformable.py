@@ -89,7 +89,7 @@ def as_tokens(maps: Sequence[Tensor]) -> Tensor:
     return torch.cat([one.flatten(2).transpose(1, 2) for one in maps], dim=1)
 
 
-def grid_of_map(one: Tensor) -> Grid:
+def map_size(one: Tensor) -> Grid:
     """Rows and columns of a map (..., rows, columns)."""
     rows, columns = one.shape[-2:]
     return rows, columns

@@ -2,8 +2,8 @@
 """The demonstration depth network, trained on generated rooms alone and shipped with the package: one image and its
 intrinsics -> depth in metres.
 
-It makes the way from two plain images to a pose run without any download, with errors that are a network's own. Of real
-pictures it knows nothing: docs/demo_net.md has its errors. Nothing chooses it but who asks for it by name.
+With it two plain images give a pose without any download. It knows nothing of real pictures: docs/demo_net.md has its
+errors. It is used only where it is asked for by name.
 
 A picture of any size is brought to 192x256 pixels. Beside its colours the network gets the slopes x/z and y/z of every
 pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell. Trained by
@@ -23,7 +23,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from garps_core.checks import Float32Array
+from garps_core.config import Reconstruction
+from garps_core.devices import on_device
 from garps_core.errors import InputError, ModelError
+from garps_core.models.depth_networks import DepthNetwork
 from garps_core.types import View
 from garps_core.weights.reader import read_tensors
 from garps_core.weights.state_dict import load_strictly
@@ -31,18 +34,18 @@ from garps_core.weights.state_dict import load_strictly
 HEIGHT, WIDTH = 192, 256
 """Pixels of the network's input; its answer has half as many a side."""
 CHANNELS = (24, 32, 64, 96, 128)
-"""Of the maps at 1/2, 1/4 ... 1/32 of the input."""
+"""Channels of the maps at 1/2, 1/4 ... 1/32 of the input."""
 BLOCKS = (0, 2, 2, 2, 1)
-"""Residual blocks at each of them."""
+"""Residual blocks of each of these maps."""
 MEAN, DEVIATION = 0.45, 0.25
-"""Of the colours, 0..1."""
+"""Mean and deviation of the colours, 0..1."""
 UNIT_FOCAL_PX = 220.0
 """A focal length that counts as 1, in pixels of the input."""
 WHAT_IT_IS = "a demonstration: it knows generated rooms only, its depth of real pictures means little"
 FILE = "demo_net.safetensors"
 MAX_BYTES = 6_000_000
 MAX_ASPECT = 3
-"""Of a picture's sides: beyond, nothing like it was ever seen in training."""
+"""Largest ratio of a picture's sides; training had none beyond."""
 
 
 class Unit(nn.Sequential):
@@ -86,7 +89,7 @@ class DemoNet(nn.Module):
         self.answer = nn.Conv2d(CHANNELS[0], 1, 3, padding=1)
 
     def forward(self, picture: Tensor) -> Tensor:
-        """(B, 5, 192, 256) of `prepared` -> logarithm of depth (m) over focal length (as the unit), (B, 96, 128)."""
+        """(B, 5, 192, 256) of `demo_input` -> logarithm of depth (m) over focal length (as the unit), (B, 96, 128)."""
         maps = []
         x = picture
         for level in self.down:
@@ -99,6 +102,11 @@ class DemoNet(nn.Module):
         return logarithm
 
 
+def load_network(weights: str, scene: str, device: str) -> DemoNet:
+    """The network in the package on the device; it has no other weights and knows no scene but its own."""
+    return on_device(shipped(), device)
+
+
 def shipped() -> DemoNet:
     """The network with the weights of this package, ready to be used. WeightsError where they are not there."""
     with as_file(files("garps_core.models").joinpath(FILE)) as path:
@@ -108,7 +116,7 @@ def shipped() -> DemoNet:
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
+def demo_input(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Float32Array, float]:
     """HxWx3 uint8 and 3x3 K (pixel centres at integers) -> input (5, 192, 256), and the focal length as the unit."""
     height, width = rgb.shape[:2]
     scale_x, scale_y = WIDTH / width, HEIGHT / height
@@ -123,8 +131,10 @@ def prepared(rgb: npt.NDArray[np.uint8], K: npt.NDArray[np.float64]) -> tuple[Fl
     return found, float(np.sqrt(fx * fy) / UNIT_FOCAL_PX)
 
 
-def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
-    """Depth of each view, HxW float32 m along z, all in one pass.
+def depth_of_views(
+    network: DemoNet, views: Sequence[View], settings: Reconstruction | None = None
+) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass; no setting changes it.
 
     Raises:
         InputError: a picture more than `MAX_ASPECT` times as long as wide, or as wide as long.
@@ -134,7 +144,7 @@ def depth_of(network: DemoNet, views: Sequence[View]) -> list[Float32Array]:
         height, width = view.rgb.shape[:2]
         if max(height, width) > MAX_ASPECT * min(height, width):
             raise InputError(f"rgb is {width}x{height}: expected sides within a factor of {MAX_ASPECT} for demo_net")
-    inputs, focals = zip(*(prepared(view.rgb, view.K) for view in views), strict=True)
+    inputs, focals = zip(*(demo_input(view.rgb, view.K) for view in views), strict=True)
     device = next(network.parameters()).device
     with torch.inference_mode():
         logarithms = network(torch.from_numpy(np.stack(inputs)).to(device)).float().cpu().numpy()
@@ -150,3 +160,6 @@ def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> F
     if not np.isfinite(depth).all():
         raise ModelError("the depth of demo_net is not finite: expected numbers; is its file what was shipped?")
     return np.asarray(depth, np.float32)
+
+
+NETWORK = DepthNetwork("in the package", load_network, depth_of_views, preset="demo_net", warning=WHAT_IT_IS)

@@ -2,8 +2,8 @@
 """Depth Anything V2 (Yang et al. 2024), the metric models: one image -> depth along the optical axis, in metres.
 
 A DINOv2 transformer, a dense prediction head, a sigmoid and the largest depth of the training: 20 m (indoor) or 80 m
-(outdoor). The weights do not tell which, nor whether they are a relative model's: the caller says so. The calibration
-does not enter the network, its scale assumes the cameras of the training.
+(outdoor). The weights do not tell which, nor whether they are a relative model's: the caller must know. The calibration
+does not enter the network; its scale assumes the cameras of the training.
 """
 
 from __future__ import annotations
@@ -19,12 +19,16 @@ import torch
 from torch import Tensor, nn
 
 from garps_core.checks import Float32Array
-from garps_core.devices import checked_device
-from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
+from garps_core.config import Reconstruction
+from garps_core.devices import checked_device, on_device
+from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
 from garps_core.models import vit
+from garps_core.models.depth_networks import DepthNetwork
 from garps_core.models.dpt import DptHead, Grid, enlarged
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer
-from garps_core.weights.manifest import MAX_DEPTH_M
+from garps_core.types import View
+from garps_core.weights.load import load_weights
+from garps_core.weights.manifest import MAX_DEPTH_M, range_of
 from garps_core.weights.state_dict import load_strictly
 
 RGBImage = npt.NDArray[np.uint8]
@@ -48,10 +52,12 @@ SHORT_SIDE = 518
 """Pixels of the shorter side of the network's input."""
 LONGEST_SIDE = 8 * SHORT_SIDE
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of red, green and blue (0..1) in the training images."""
+"""Mean and deviation of red, green and blue (0..1) in the training images."""
 TRAINING_FX = 0.5 / np.tan(np.radians(60) / 2)
 """Focal length over image width of the indoor training's cameras: 60 deg wide."""
 DTYPES = {torch.float32, torch.float16, torch.bfloat16}
+AT_THE_END = 0.98
+"""Share of the network's largest depth; a pixel beyond it is at the end of the network's range."""
 
 
 class DepthAnythingV2(nn.Module):
@@ -68,6 +74,39 @@ class DepthAnythingV2(nn.Module):
         """(B, 3, H, W), normalised, sides multiples of 14 -> depth (B, H, W), float32, metres."""
         logit: Tensor = self.depth_head(self.pretrained(image, self.head.taps))
         return self.max_depth * logit.squeeze(1).float().sigmoid()
+
+
+def load_network(weights: str, scene: str, device: str) -> DepthAnythingV2:
+    """Read the weights by name or file ("" = the first installed) and build the network on the device.
+
+    scene: any, indoor or outdoor. Raises WeightsError, ConfigError, ModelError.
+    """
+    variant = "" if scene == "any" else scene
+    path, read = load_weights(weights, "depth_anything", variant)
+    network = built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
+    return on_device(network, device)
+
+
+def depths(network: DepthAnythingV2, views: Sequence[View], settings: Reconstruction) -> list[Float32Array]:
+    """Depth of each view, HxW float32 m along z, all in one pass.
+
+    Raises ReconstructionError where most of a picture lies at the end of the range; else as `depth_of_images`.
+    """
+    images = [view.rgb for view in views]
+    fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
+    found = depth_of_images(network, images, fx=fx, dtype=getattr(torch, settings.network_dtype))
+    for view, depth, largest_m in zip(views, found, network.max_depth * focal_factors(images, fx), strict=True):
+        _check_range(view, depth, float(largest_m))
+    return found
+
+
+def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
+    far = float(np.mean(depth >= AT_THE_END * largest_m))
+    if far > 0.5:
+        raise ReconstructionError(
+            f"{far:.0%} of the network's depth of {view.frame_id or 'a view'} is {largest_m:g} m, all it can say: "
+            "expected rooms for indoor weights, streets for outdoor ones, and no relative model's"
+        )
 
 
 def built_from(tensors: Mapping[str, Tensor], max_depth: float) -> DepthAnythingV2:
@@ -118,7 +157,7 @@ _OTHER_NAMES = (
 def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of an `-hf` file, as the `transformers` library names them -> the same under the official names.
 
-    Raises WeightsError for a name that is not known, or an attention that is not whole.
+    Raises WeightsError for an unexpected name, or an incomplete attention layer.
     """
     prefix = "backbone."
     backbone = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
@@ -127,7 +166,7 @@ def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return official | {f"depth_head.{key}": value for key, value in vit.renamed(head, _OTHER_NAMES).items()}
 
 
-def depth_of(
+def depth_of_images(
     model: DepthAnythingV2,
     images: Sequence[RGBImage],
     *,
@@ -165,7 +204,7 @@ def depth_of(
     found: dict[int, Float32Array] = {}
     for size in dict.fromkeys(sizes):
         members = [i for i, own in enumerate(sizes) if own == size]
-        depths = _passed(model, [prepared(images[i], size) for i in members], dtype)
+        depths = _passed(model, [resized_input(images[i], size) for i in members], dtype)
         for i, depth in zip(members, depths, strict=True):
             found[i] = scales[i] * _resized_back(depth, images[i].shape[:2])
     return [found[i] for i in range(len(images))]
@@ -197,7 +236,7 @@ def network_size(image: RGBImage) -> Grid:
     return rows, columns
 
 
-def prepared(image: RGBImage, size: Grid) -> Tensor:
+def resized_input(image: RGBImage, size: Grid) -> Tensor:
     """HxWx3 uint8 RGB -> the network's input (3, *size), float32: cubic resize of 0..1 and normalised, in float64."""
     resized = cv2.resize(image / 255.0, size[::-1], interpolation=cv2.INTER_CUBIC)
     normalised = (resized - np.array(MEAN)) / np.array(DEVIATION)
@@ -246,3 +285,8 @@ def _pass(model: DepthAnythingV2, batch: Tensor, dtype: torch.dtype) -> Tensor:
 def _resized_back(depth: Tensor, size: Grid) -> Float32Array:
     """Depth (h, w) at the network's size -> at the image's, corner pixels on corner pixels."""
     return enlarged(depth[None, None], size)[0, 0].cpu().numpy()
+
+
+NETWORK = DepthNetwork(
+    "Depth Anything V2, metric, for rooms or for streets", load_network, depths, weights_kind="depth_anything"
+)

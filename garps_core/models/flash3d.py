@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from garps_core.errors import WeightsError
 from garps_core.models.resnet import FEATURE_CHANNELS, ResNet50
+from garps_core.weights.load import load_weights
 from garps_core.weights.state_dict import load_strictly
 
 LAYERS = 2
@@ -32,7 +33,7 @@ PADDED = (HEIGHT + 2 * PAD, WIDTH + 2 * PAD)
 GAUSSIAN_CHANNELS = (32, 32, 64, 128, 256)
 DEPTH_CHANNELS = (16, 32, 64, 128, 256)
 PARTS = {"offset": 3, "opacity": 1, "scale": 3, "rotation": 4, "harmonics_0": 3, "harmonics_1": 9}
-"""What the 23 channels of a Gaussian decoder are, in their order."""
+"""Meaning of the 23 channels of a Gaussian decoder, in their order."""
 
 DEPTH_UNIT_M = 20.0
 MEAN, DEVIATION = 0.45, 0.225
@@ -45,7 +46,7 @@ COUNTER = "num_batches_tracked"
 
 @dataclass(frozen=True, eq=False)
 class GaussianMaps:
-    """What the network says of every pixel of the padded picture; float32, first index = layer.
+    """The output of the network for every pixel of the padded picture; float32, first index = layer.
 
     Args:
         depth: (2, 1, H, W) m along z.
@@ -77,7 +78,7 @@ class PaddedConv(nn.Module):
 
 
 class ConvBlock(nn.Module):
-    """The same with ELU behind it."""
+    """The same convolution, followed by ELU."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -205,6 +206,11 @@ def flash3d_tensors(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dic
     read = {prefix + name for name in expected}
     left = Counter(_group_of(key, prefix) for key in state if key not in read)
     return found, dict(left)
+
+
+def load_network(weights: str) -> Flash3D:
+    """Read the weights by name or file ("" = the first installed) and build the network. Raises WeightsError."""
+    return flash3d_network(flash3d_tensors(load_weights(weights, "flash3d")[1].tensors)[0])
 
 
 def flash3d_network(tensors: Mapping[str, Tensor]) -> Flash3D:

@@ -1,176 +1,173 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks that are in use: found by name or file, loaded once, asked for depth, Gaussians or labels."""
+"""The networks of one owner: loaded when they are first needed, kept, asked for depth, labels or point maps.
+
+This module is light to import: the file of a network is imported when that network is asked for.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from pathlib import Path
-from typing import TypeVar
+import weakref
+from collections.abc import Callable, Hashable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 import torch
-from torch import nn
 
 from garps_core.checks import Float32Array, IntArray
-from garps_core.config import Config, Reconstruction
-from garps_core.devices import checked_device
-from garps_core.errors import ModelError, ReconstructionError, WeightsError
-from garps_core.models import demo_net, mask2former, semantics
-from garps_core.models.depth_anything import DepthAnythingV2, RGBImage, built_from, depth_of, focal_factors
-from garps_core.models.flash3d import Flash3D, flash3d_network, flash3d_tensors
+from garps_core.config import Config
+from garps_core.config.start import TWO_VIEW
+from garps_core.devices import on_device
+from garps_core.errors import ConfigError
+from garps_core.models.depth_networks import depth_network, load_network, metric_depths, network_name
+from garps_core.point_maps import PairMaps, Picture, TwoViewModel
 from garps_core.types import View
-from garps_core.weights.manifest import BY_NAME, PERMISSIVE, licence_of, named, of_file, range_of
-from garps_core.weights.reader import Tensors, read_tensors
-from garps_core.weights.store import default, installed, weights_folder
+from garps_core.weights.store import weights_folder
 
-AT_THE_END = 0.98
-"""Share of the network's largest depth from which on a pixel is as far as the network can say."""
+if TYPE_CHECKING:
+    from garps_core.models.flash3d import Flash3D
+    from garps_core.models.mask2former import Mask2Former
+    from garps_core.models.mast3r import NaverModel
+    from garps_core.models.semantics import Segmenter
 
-DTYPE = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
-LOG = logging.getLogger("garps_core")
 Made = TypeVar("Made")
-Network = TypeVar("Network", bound=nn.Module)
-_LOCK = threading.RLock()
+LOG = logging.getLogger("garps_core")
+_ALIVE: weakref.WeakSet[Networks] = weakref.WeakSet()
 
 
-def depths(views: Sequence[View], config: Config) -> list[Float32Array]:
-    """Metric depth of each view, HxW float32 m along z, by the depth network of the settings, in one pass.
+class Networks:
+    """Networks that are loaded on first use; of every kind the last one is kept.
 
-    Raises:
-        WeightsError: none installed, or not what it should be. ModelError: too little memory, not finite.
-        InputError: a picture too elongated for the network.
-        ReconstructionError: most of a picture lies at the end of the network's range.
+    Threads may share an instance: a network that several want at once is loaded once. A pickled or copied instance
+    comes out empty. After a fork the child keeps the networks and gets a lock of its own; CUDA does not survive a fork.
     """
-    settings = config.reconstruction
-    network = on_device(depth_network_of(settings), config.device)
-    if isinstance(network, demo_net.DemoNet):
-        return [depth * np.float32(settings.depth_scale) for depth in demo_net.depth_of(network, views)]
-    images = [view.rgb for view in views]
-    fx = [float(view.K[0, 0]) for view in views] if settings.focal_correction else None
-    found = depth_of(network, images, depth_scale=settings.depth_scale, fx=fx, dtype=dtype_of(config))
-    largest = network.max_depth * settings.depth_scale * focal_factors(images, fx)
-    for view, depth, largest_m in zip(views, found, largest, strict=True):
-        _check_range(view, depth, float(largest_m))
-    return found
 
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._kept: dict[str, tuple[Hashable, Any]] = {}
+        _ALIVE.add(self)
 
-def _check_range(view: View, depth: Float32Array, largest_m: float) -> None:
-    far = float(np.mean(depth >= AT_THE_END * largest_m))
-    if far > 0.5:
-        raise ReconstructionError(
-            f"{far:.0%} of the network's depth of {view.frame_id or 'a view'} is {largest_m:g} m, all it can say: "
-            "expected rooms for indoor weights, streets for outdoor ones, and no relative model's"
+    def __reduce__(self) -> tuple[type[Networks], tuple[()]]:
+        return Networks, ()
+
+    def depths(self, views: Sequence[View], config: Config) -> list[Float32Array]:
+        """Metric depth of each view, HxW float32 m along z, by the depth network of the settings, in one pass.
+
+        Raises:
+            WeightsError: none installed, or not what it should be. ModelError: too little memory, not finite.
+            InputError: a picture too elongated for the network.
+            ReconstructionError: most of a picture lies at the end of the network's range.
+            ConfigError: the network cannot be loaded.
+        """
+        return metric_depths(
+            network_name(config.reconstruction), self.depth_network(config), views, config.reconstruction
         )
 
+    def labels(self, rgb: Picture, config: Config) -> IntArray:
+        """Class of every pixel, HxW, by the segmentation of the settings. Raises WeightsError, ModelError."""
+        from garps_core.models import mask2former, semantics
 
-def labels(rgb: RGBImage, config: Config) -> IntArray:
-    """Class of every pixel, HxW, by the segmentation of the settings. Raises WeightsError, ModelError."""
-    settings = config.reconstruction
-    network = on_device(
-        segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone), config.device
-    )
-    if isinstance(network, mask2former.Mask2Former):
-        return mask2former.segment_by_masks(network, rgb)
-    return semantics.segment(network, rgb, dtype=dtype_of(config))
+        network = self.segmenter(config)
+        if isinstance(network, mask2former.Mask2Former):
+            return mask2former.segment_by_masks(network, rgb)
+        return semantics.segment(network, rgb, dtype=dtype_of(config))
+
+    def pair_maps(self, source: Picture, target: Picture, config: Config) -> PairMaps:
+        """Point maps of two pictures HxWx3 uint8 RGB by the two-view network of `config.start`.
+
+        Raises:
+            WeightsError: none installed, or not what they should be.
+            ModelError: too little memory, values that are not finite, or whatever goes wrong in an adapter.
+            ConfigError: no two-view network is chosen, or no adapter of that name is installed.
+        """
+        from garps_core.models.two_view_in_use import maps_by_adapter
+
+        model = self.two_view(config)
+        if config.start.method == "adapter":
+            return maps_by_adapter(config.start.adapter, model, source, target)
+        return model(source, target)
+
+    def depth_network(self, config: Config) -> Any:
+        """The depth network of `config.reconstruction`, on the device. Raises WeightsError, ModelError, ConfigError."""
+        settings = config.reconstruction
+        name = network_name(settings)
+        key = name, settings.depth_weights, settings.scene, config.device
+
+        def load() -> Any:
+            if warning := depth_network(name).warning:
+                LOG.warning("%s is %s", name, warning)
+            return load_network(*key)
+
+        return self._once("depth", key, load)
+
+    def flash3d(self, config: Config) -> Flash3D:
+        """Flash3D with the weights of the settings, on the device. Raises WeightsError, ModelError, ConfigError."""
+        from garps_core.models import flash3d
+
+        weights = config.reconstruction.flash3d_weights
+        return on_device(self._once("flash3d", (weights,), lambda: flash3d.load_network(weights)), config.device)
+
+    def segmenter(self, config: Config) -> Segmenter | Mask2Former:
+        """The segmentation of the settings, on the device. Raises WeightsError, ModelError, ConfigError."""
+        from garps_core.models import mask2former, semantics
+        from garps_core.weights.load import load_weights
+
+        settings = config.reconstruction
+        key = settings.semantics, settings.semantic_weights, settings.semantic_backbone
+
+        def load() -> Segmenter | Mask2Former:
+            if settings.semantics == "m2f":
+                return mask2former.mask2former_of(load_weights(settings.semantic_weights, "m2f")[1].tensors)
+            return semantics.load_network(*key)
+
+        return on_device(self._once("labels", key, load), config.device)
+
+    def two_view(self, config: Config) -> TwoViewModel:
+        """The network that `config.start.method` names, on the device. Raises as `pair_maps`."""
+        from garps_core.models import two_view_in_use
+
+        start = config.start
+        if start.method not in TWO_VIEW:
+            raise ConfigError(
+                f"start.method is {start.method}: expected a two-view network, one of {', '.join(TWO_VIEW)}"
+            )
+        if start.method == "adapter":
+            of_adapter = start.adapter, start.weights, config.device
+            return self._once("adapter", of_adapter, lambda: two_view_in_use.load_adapter(*of_adapter))
+        key = start.method, start.weights
+        network, variant = self._once("two_view", key, lambda: two_view_in_use.load_network(*key))
+        on_device(network, config.device)
+
+        def model() -> NaverModel:
+            return two_view_in_use.NaverModel(network, variant, dtype_of(config))
+
+        return self._once("two_view model", (*key, config.reconstruction.network_dtype), model)
+
+    def _once(self, kind: str, key: tuple[str, ...], load: Callable[[], Made]) -> Made:
+        """Return what is kept of this kind if it was loaded under this key; else load it and keep it."""
+        whole = weights_folder(), *key  # in another folder the same name is another file
+        with self._lock:
+            if kind not in self._kept or self._kept[kind][0] != whole:
+                self._kept.pop(kind, None)  # two large networks at once may not fit
+                self._kept[kind] = whole, load()
+            made: Made = self._kept[kind][1]
+            return made
+
+    def _after_fork(self) -> None:
+        self._lock = threading.RLock()  # whichever thread held the other is not here to release it
+
+
+def _unlock_all() -> None:
+    for networks in list(_ALIVE):
+        networks._after_fork()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_unlock_all)
 
 
 def dtype_of(config: Config) -> torch.dtype:
-    """What the networks compute in."""
-    return DTYPE[config.reconstruction.network_dtype]
-
-
-def on_device(network: Network, device: str) -> Network:
-    """The network, moved there. Raises ConfigError for a device that is not there, ModelError where it does not fit."""
-    try:
-        return network.to(checked_device(device))
-    except torch.cuda.OutOfMemoryError as error:
-        raise ModelError(
-            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit; free some, "
-            f"choose a smaller network, or use the CPU ({error})"
-        ) from None
-
-
-def once(load: Callable[..., Made]) -> Callable[..., Made]:
-    """Keep the last network that was loaded so; two threads that want it at once load it once."""
-    kept = lru_cache(maxsize=1)(lambda folder, *given: load(*given))
-
-    def under_lock(*given: str) -> Made:
-        with _LOCK:
-            return kept(weights_folder(), *given)  # in another folder "" is another file
-
-    return under_lock
-
-
-def depth_network_of(settings: Reconstruction) -> DepthAnythingV2 | demo_net.DemoNet:
-    """The depth network that the settings ask for. Raises WeightsError."""
-    if settings.method == "demo_net":
-        return demonstration()
-    return depth_network(settings.depth_weights, settings.scene)
-
-
-@once
-def depth_network(weights: str, scene: str) -> DepthAnythingV2:
-    """Depth Anything V2 from a name, a file or, for "", what is installed; scene = any, indoor or outdoor."""
-    variant = "" if scene == "any" else scene
-    path, read = tensors_of(weights, "depth_anything", variant)
-    return built_from(read.tensors, range_of(path.name, read.metadata, variant, "reconstruction.scene"))
-
-
-@once
-def demonstration() -> demo_net.DemoNet:
-    """The network in the package; that it is a demonstration is told to whoever listens to the log."""
-    LOG.warning("demo_net is %s", demo_net.WHAT_IT_IS)
-    return demo_net.shipped()
-
-
-@once
-def _flash3d(weights: str) -> Flash3D:
-    return flash3d_network(flash3d_tensors(tensors_of(weights, "flash3d")[1].tensors)[0])
-
-
-def flash3d(weights: str, device: str) -> Flash3D:
-    """Flash3D from a name, a file or, for "", what is installed; on the device."""
-    return on_device(_flash3d(weights), device)
-
-
-@once
-def segmenter(kind: str, weights: str, backbone: str) -> semantics.Segmenter | mask2former.Mask2Former:
-    """A segmentation of kind linear, ms or m2f from names, files or, for "", what is installed."""
-    if kind == "m2f":
-        return mask2former.mask2former_of(tensors_of(weights, "m2f")[1].tensors)
-    path, head = tensors_of(weights, f"ade20k_{kind}")
-    known = of_file(path.name)
-    if not backbone and known is not None:
-        fitting = [one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size]
-        backbone = next(filter(installed, fitting), fitting[0])
-    return semantics.segmenter_of(tensors_of(backbone, "dinov2")[1].tensors, head.tensors)
-
-
-def tensors_of(weights: str, kind: str, variant: str = "") -> tuple[Path, Tensors]:
-    """Path and content of weights that are given by name or file; "" = the first that is installed.
-
-    Licences that do not permit everything are told to whoever listens to the log.
-    """
-    path, found = _read(weights, kind, variant)
-    licence = licence_of(path.name, found.metadata, kind)
-    if licence not in PERMISSIVE:
-        LOG.warning("licence of the weights %s: %s", path.name, licence)
-    return path, found
-
-
-def _read(weights: str, kind: str, variant: str) -> tuple[Path, Tensors]:
-    name = weights or default(kind, variant).name
-    if name not in BY_NAME:
-        path = Path(weights).expanduser()
-        if path.suffix not in (".pth", ".pt", ".safetensors"):
-            named(name)  # raises, with the nearest names
-        return path, read_tensors(path, kind=kind)
-    entry, there = named(name), installed(name)
-    if entry.kind != kind:
-        raise WeightsError(f"{name} are weights of {entry.kind}: expected some of {kind}; see `garps weights list`")
-    if there is None:
-        raise WeightsError(f"{name} is not installed: run `garps weights fetch {name}`, or name another file")
-    return there, read_tensors(there, max_bytes=entry.bytes or entry.bytes_bound, sha256=entry.sha256, kind=kind)
+    """The type that `reconstruction.network_dtype` names."""
+    dtype: torch.dtype = getattr(torch, config.reconstruction.network_dtype)
+    return dtype

@@ -28,7 +28,7 @@ from garps_core.models.deformable import (
     as_maps,
     as_tokens,
     centres,
-    grid_of_map,
+    map_size,
     sine_positions,
 )
 from garps_core.models.depth_anything import DEVIATION, MEAN, RGBImage, checked_image
@@ -38,7 +38,7 @@ from garps_core.models.vit_adapter import COARSEST, AdapterSize, ViTAdapter, ada
 from garps_core.weights.state_dict import load_strictly
 
 GROUPS = 32
-"""Of every group normalisation."""
+"""Groups of every group normalisation."""
 LEVELS = 3
 """Maps that deformable attention and the queries look at."""
 SIDE = math.lcm(PATCH, COARSEST)
@@ -78,7 +78,7 @@ def head_size(tensors: Mapping[str, Tensor]) -> HeadSize:
 
 
 class FeedForward(nn.Module):
-    """What two layers with ReLU between add to the tokens."""
+    """Two layers with ReLU between, added to the tokens."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class PixelDecoder(nn.Module):
     def forward(self, maps: list[Tensor]) -> tuple[Tensor, list[Tensor]]:  # noqa: D102
         finest, *coarser = maps
         taken = [conv(one) for conv, one in zip(self.input_convs, reversed(coarser), strict=True)]
-        grids = [grid_of_map(one) for one in taken]
+        grids = [map_size(one) for one in taken]
         x, places = as_tokens(taken), centres(grids, finest)
         positions = torch.cat(
             [sine_positions(grid, x.shape[-1], x) + self.level_encoding.weight[i] for i, grid in enumerate(grids)]
@@ -158,7 +158,7 @@ class PixelDecoder(nn.Module):
 
 
 class PlainAttention(nn.Module):
-    """What queries (B, Q, D) find among keys and values (B, N, D); not where `blocked` (B * heads, Q, N) is True."""
+    """Attention of queries (B, Q, D) to keys and values (B, N, D), except where `blocked` (B * heads, Q, N)."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -212,7 +212,7 @@ class Mask2FormerHead(nn.Module):
 
     def forward(self, maps: list[Tensor]) -> Tensor:  # noqa: D102
         features, refined = self.pixel_decoder(maps)
-        grids = [grid_of_map(one) for one in refined]
+        grids = [map_size(one) for one in refined]
         values = [as_tokens([one]) + self.level_embed.weight[i] for i, one in enumerate(refined)]
         positions = [sine_positions(grid, tokens.shape[-1], tokens) for grid, tokens in zip(grids, values, strict=True)]
         x = self.query_feat.weight.expand(len(features), -1, -1)

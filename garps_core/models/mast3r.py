@@ -35,7 +35,7 @@ Part = TypeVar("Part")
 Found = TypeVar("Found")
 
 
-def prepared(rgb: Picture, long_side: int = LONG_SIDE) -> tuple[Tensor, Framing]:
+def cropped_input(rgb: Picture, long_side: int = LONG_SIDE) -> tuple[Tensor, Framing]:
     """HxWx3 uint8 RGB -> the network's input (3, h, w), float32 in -1..1, and which part of the picture it is.
 
     The middle of the resized picture, h and w multiples of 16; of a square picture three quarters of the height.
@@ -48,8 +48,8 @@ def prepared(rgb: Picture, long_side: int = LONG_SIDE) -> tuple[Tensor, Framing]
     return _cut(rgb, resized, (rows // PATCH * PATCH, columns // PATCH * PATCH))
 
 
-def prepared_square(rgb: Picture, side: int) -> tuple[Tensor, Framing]:
-    """The same for a network that sees the middle square, side x side pixels."""
+def square_input(rgb: Picture, side: int) -> tuple[Tensor, Framing]:
+    """The input of a network that sees the middle square, side x side pixels."""
     height, width = rgb.shape[:2]
     resized = _resized(rgb, round(side * max(height, width) / max(min(height, width), 1)))
     return _cut(rgb, resized, (side, side))
@@ -135,9 +135,9 @@ class NaverModel:
         return next(self.network.parameters()).device
 
     def _encoded(self, pictures: Sequence[Picture]) -> list[_Encoded]:
-        """Both pictures, those that are not kept from before by the network."""
+        """Encode both pictures; the network runs on those that are not kept from before."""
         keys = [(digest(picture), self._device) for picture in pictures]
-        new = {key: self._prepared(rgb) for key, rgb in zip(keys, pictures, strict=True) if key not in self._kept}
+        new = {key: self._input(rgb) for key, rgb in zip(keys, pictures, strict=True) if key not in self._kept}
         inputs = [seen for seen, _ in new.values()]
         tokens = self._each(self._encode, inputs, alike=len({seen.shape for seen in inputs}) == 1)
         known = self._kept | {
@@ -147,8 +147,10 @@ class NaverModel:
         self._kept = dict([*others, *((key, known[key]) for key in keys)][-KEPT:])
         return [known[key] for key in keys]
 
-    def _prepared(self, rgb: Picture) -> tuple[Tensor, Framing]:
-        return prepared(rgb, self._long_side) if self._square_side is None else prepared_square(rgb, self._square_side)
+    def _input(self, rgb: Picture) -> tuple[Tensor, Framing]:
+        return (
+            cropped_input(rgb, self._long_side) if self._square_side is None else square_input(rgb, self._square_side)
+        )
 
     def _encode(self, inputs: list[Tensor]) -> list[Tensor]:
         """Tokens (1, N, D) of each input (3, h, w), all of one size."""
@@ -156,7 +158,7 @@ class NaverModel:
         return [tokens[i : i + 1] for i in range(len(tokens))]
 
     def _decode(self, orders: list[tuple[_Encoded, _Encoded]]) -> list[tuple[PointMap, PointMap]]:
-        """Both views of each order; the first views are of one size, and the second ones."""
+        """Decode both views of each order; the first views have one size, the second ones too."""
         first, second = (torch.cat([order[i].tokens for order in orders]) for i in (0, 1))
         seen = self.network.decode(first, orders[0][0].grid, second, orders[0][1].grid)
         one, two = (self._point_maps(maps) for maps in seen)

@@ -14,7 +14,7 @@ LANCZOS_LOBES = 3
 CUBIC_STEEPNESS = -0.5
 """Slope of the cubic kernel one pixel away from its centre."""
 FRACTION_BITS = 22
-"""Of the weights, which are rounded, so that their sums are the same on every machine."""
+"""Fractional bits of the weights, which are rounded so that their sums agree on every machine."""
 
 Bytes = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.intp]
@@ -31,12 +31,12 @@ def lanczos(picture: Bytes, height: int, width: int) -> Bytes:
 
 
 def bicubic(picture: Bytes, height: int, width: int) -> Bytes:
-    """The same by the cubic kernel of Catmull and Rom."""
+    """Resize by the cubic kernel of Catmull and Rom."""
     return _resized(picture, height, width, _cubic, 2)
 
 
 def nearest_index(size: int, wanted: int) -> Index:
-    """Which of `size` cells holds the centre of each of `wanted` cells of the same length in all."""
+    """Index of the one of `size` cells that holds the centre of each of `wanted` cells; both rows are equally long."""
     return np.asarray((2 * np.arange(wanted) + 1) * size // (2 * wanted), np.intp)
 
 
@@ -64,7 +64,7 @@ def _resized_lines(lines: Bytes, index: Index, weights: Weights) -> Bytes:
 
 
 def _taps(size: int, wanted: int, kernel: Kernel, reach: int) -> tuple[Index, Weights]:
-    """For every wanted entry the entries it reads, and their weights with sum 2**FRACTION_BITS; both (wanted, taps)."""
+    """Entries that each wanted entry reads, and their weights with sum 2**FRACTION_BITS; both (wanted, taps)."""
     scale = size / wanted
     stretch = max(scale, 1.0)
     centre = (np.arange(wanted) + 0.5) * scale

@@ -25,12 +25,15 @@ from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models.depth_anything import DEVIATION, DTYPES, MEAN, RGBImage, checked_image
 from garps_core.models.vit import PATCH, SIZES, VisionTransformer, from_transformers, size_of
 from garps_core.types import Mixture
+from garps_core.weights.load import load_weights
+from garps_core.weights.manifest import BY_NAME, of_file
 from garps_core.weights.state_dict import load_strictly
+from garps_core.weights.store import installed
 
 RATIOS = (1.0, 1.32, 1.73)
 """Sizes of the picture that the published multi-scale test merges (some add 2.28 and 3.0)."""
 LAST_BLOCKS = (1, 4)
-"""How many blocks a head may see: linear, ms."""
+"""Blocks that a head sees, counted from the last: linear, ms."""
 BAND_ROWS = 64
 """Rows of the picture that hold all classes at once."""
 
@@ -64,6 +67,19 @@ class Segmenter(nn.Module):
         """(B, 3, H, W), normalised, sides multiples of 14 -> scores (B, classes, H / 14, W / 14), float32."""
         scores: Tensor = self.decode_head(torch.cat(self.backbone(picture, self.taps), dim=1))
         return scores.float()
+
+
+def load_network(kind: str, weights: str, backbone: str) -> Segmenter:
+    """Read a head of kind linear or ms and its backbone, and build the network. Raises WeightsError.
+
+    Both are given by name or file; "" = the first installed head, and the installed backbone of the head's size.
+    """
+    path, head = load_weights(weights, f"ade20k_{kind}")
+    known = of_file(path.name)
+    if not backbone and known is not None:
+        fitting = [one.name for one in BY_NAME.values() if one.kind == "dinov2" and one.size == known.size]
+        backbone = next(filter(installed, fitting), fitting[0])
+    return segmenter_of(load_weights(backbone, "dinov2")[1].tensors, head.tensors)
 
 
 def segmenter_of(backbone: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Segmenter:
@@ -172,7 +188,7 @@ def scores_of(
     height, width = image.shape[:2]
     size = (max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5)))
     picture = image if size == (height, width) else cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR)
-    given = prepared(np.asarray(picture[:, ::-1] if mirrored else picture, np.uint8)).to(device)
+    given = padded_input(np.asarray(picture[:, ::-1] if mirrored else picture, np.uint8)).to(device)
     try:
         with torch.inference_mode(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             patches: Tensor = network(given)[0]
@@ -187,7 +203,7 @@ def scores_of(
     return Scores(patches @ (columns.flip(0) if mirrored else columns).T, rows)
 
 
-def prepared(picture: RGBImage) -> Tensor:
+def padded_input(picture: RGBImage) -> Tensor:
     """HxWx3 uint8 RGB -> (1, 3, H', W') float32, normalised, zeros around it up to multiples of 14.
 
     Of an odd number of missing rows or columns the larger half comes below or at the right.

@@ -22,7 +22,7 @@ from garps_core.models.vit import EPSILON, Mlp
 from garps_core.weights.state_dict import load_strictly, recognised
 
 BASE = 100.0
-"""Of the rotations: from 1 radian per patch down to nearly 1/BASE."""
+"""Base of the rotations, which go from 1 radian per patch down to nearly 1/BASE."""
 HEAD_WIDTH = 64
 """Channels of an attention head in every published network; the tensors do not tell."""
 MOST_BLOCKS = 64
@@ -51,7 +51,7 @@ class Architecture:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Name of the architecture in words."""
         return "MASt3R" if self.descriptors else f"DUSt3R with a {'linear' if self.linear else 'DPT'} head"
 
 
@@ -106,7 +106,7 @@ class CrossAttention(nn.Module):
 
 
 class EncoderBlock(nn.Module):
-    """What attention adds to the tokens, then what the two-layer network adds."""
+    """Attention, then a two-layer network, each added to the tokens."""
 
     def __init__(self, size: Stack) -> None:
         super().__init__()
@@ -123,7 +123,7 @@ class EncoderBlock(nn.Module):
 
 
 class DecoderBlock(nn.Module):
-    """The same with a look at the other view between."""
+    """A block with attention to the other view between."""
 
     def __init__(self, size: Stack) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class TwoView(nn.Module):
     def encode(self, pictures: Tensor) -> Tensor:
         """Pictures (B, 3, H, W), in -1..1 -> tokens (B, H/16 * W/16, D), row-major. InputError for other sides."""
         encoder = self.architecture.encoder
-        turn = rotation(grid_of(pictures), encoder.width // encoder.heads, pictures.device)
+        turn = rotation(token_grid(pictures), encoder.width // encoder.heads, pictures.device)
         x: Tensor = self.patch_embed(pictures).to(self.mask_token.dtype)  # sums stay exact where autocast is on
         for block in self.enc_blocks:
             x = block(x, turn)
@@ -200,7 +200,7 @@ def _head(architecture: Architecture) -> nn.Module:
 
 
 def rotation(grid: Grid, width: int, device: torch.device | str = "cpu") -> Rotation:
-    """How far the head's channels of every patch of a grid are turned, row-major; width: of an attention head."""
+    """Rotations of the head's channels for every patch of a grid, row-major; width: of an attention head."""
     rows, columns = (torch.arange(n, dtype=torch.float32, device=device) for n in grid)
     places = torch.cartesian_prod(rows, columns)  # (N, 2)
     steps = torch.arange(0, width // 2, 2, dtype=torch.float32, device=device) / (width // 2)
@@ -223,7 +223,7 @@ def attended(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
 
-def grid_of(pictures: Tensor) -> Grid:
+def token_grid(pictures: Tensor) -> Grid:
     """Rows and columns of patches of (B, 3, H, W). Raises InputError unless H and W are multiples of 16."""
     height, width = pictures.shape[-2:]
     if height % PATCH or width % PATCH or not height or not width:

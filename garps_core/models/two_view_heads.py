@@ -22,7 +22,7 @@ from garps_core.models.dpt import Fusion, Grid, enlarged
 PATCH = 16
 """Side of a patch, pixels."""
 CHANNELS = (96, 192, 384, 768)
-"""Of the dense head's pyramid, fine to coarse."""
+"""Channels of the dense head's pyramid, fine to coarse."""
 FEATURES = 256
 """Channels of the dense head's fusion."""
 POINT_CHANNELS = 4
@@ -32,7 +32,7 @@ LEAST_LENGTH = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ViewMaps:
-    """What the network says of the pixels of one view, B of them at once.
+    """The output of the network for the pixels of one view, B of them at once.
 
     Args:
         points: (B, h, w, 3), x right, y down, z forward in the first view's camera.
@@ -142,7 +142,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(decoder, POINT_CHANNELS * PATCH**2)
 
     def forward(self, tokens: Sequence[Tensor], grid: Grid) -> ViewMaps:
-        """As of `DenseHead`."""
+        """Return what `DenseHead` returns."""
         return ViewMaps(*activated(pixels(self.proj(tokens[-1]), grid)))
 
 

@@ -24,7 +24,7 @@ GRID = 37
 GRID_OFFSET = 0.1
 """Added to the wanted grid where positions are interpolated; it moves the samples, and the weights were trained so."""
 EPSILON = 1e-6
-"""Of every layer norm."""
+"""Epsilon of every layer norm."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """What attention adds to the tokens, then what the two-layer network adds."""
+    """Attention, then a two-layer network, each added to the tokens."""
 
     def __init__(self, size: VitSize) -> None:
         super().__init__()
@@ -155,7 +155,7 @@ class VisionTransformer(nn.Module):
         of `taps`, a view of the tokens (channels last in memory). Blocks behind the last tap are not computed.
         Raises InputError for other sides.
         """
-        grid = grid_of(image)
+        grid = patch_grid(image)
         x, found = self.tokens(image), {}
         for index, block in enumerate(self.blocks[: max(taps) + 1]):
             x = block(x)
@@ -164,10 +164,10 @@ class VisionTransformer(nn.Module):
         return [found[index] for index in taps]
 
     def tokens(self, image: Tensor) -> Tensor:
-        """What the first block gets: class token and patches with their positions, (B, 1 + rows * columns, D)."""
+        """Input of the first block: class token and patches with their positions, (B, 1 + rows * columns, D)."""
         patches = self.patch_embed(image).to(self.cls_token.dtype)
         everything = torch.cat((self.cls_token.expand(len(patches), -1, -1), patches), dim=1)
-        return everything + self.positions(grid_of(image))
+        return everything + self.positions(patch_grid(image))
 
     def positions(self, grid: tuple[int, int]) -> Tensor:
         """Position embedding of a grid (rows, columns) of patches, class first: (1, 1 + rows * columns, D)."""
@@ -179,7 +179,7 @@ class VisionTransformer(nn.Module):
         return torch.cat((self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2).to(self.pos_embed.dtype)), dim=1)
 
 
-def grid_of(image: Tensor) -> tuple[int, int]:
+def patch_grid(image: Tensor) -> tuple[int, int]:
     """Rows and columns of patches of (B, 3, H, W). Raises InputError unless H and W are multiples of 14."""
     height, width = image.shape[-2:]
     if height % PATCH or width % PATCH or not height or not width:
@@ -229,8 +229,8 @@ _OTHER_NAMES = (
 def from_transformers(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Tensors of a DINOv2 backbone as the `transformers` library names them -> the same under the official names.
 
-    Queries, keys and values, apart there, are stacked. Raises WeightsError for a name that is not known, or a stack
-    that is not whole.
+    Queries, keys and values, apart there, are stacked. Raises WeightsError for an unexpected name, or an
+    incomplete stack.
     """
     named = renamed(tensors, _OTHER_NAMES)
     apart = re.compile(r"\.attn\.[qkv]\.")

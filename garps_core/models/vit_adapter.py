@@ -23,7 +23,7 @@ from garps_core.models.deformable import (
     as_maps,
     as_tokens,
     centres,
-    grid_of_map,
+    map_size,
 )
 from garps_core.models.vit import EPSILON, GRID, PATCH, Attention, PatchEmbed
 
@@ -34,7 +34,7 @@ HEAD_WIDTH = 64
 PYRAMID = (64, 128, 256, 256)
 """Channels of the convolutions at 1/4, 1/8, 1/16, 1/32."""
 EXTRA_EXTRACTORS = 2
-"""Behind the last group of blocks."""
+"""Additional extractors behind the last group of blocks."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def adapter_size(tensors: Mapping[str, Tensor]) -> AdapterSize:
 
 
 def counted(tensors: Mapping[str, Tensor], start: str) -> int:
-    """How many numbered parts begin with `start`."""
+    """Number of numbered parts whose names start with `start`."""
     return len({key.removeprefix(start).split(".")[0] for key in tensors if key.startswith(start)})
 
 
@@ -127,7 +127,7 @@ class SpatialPrior(nn.Module):
 
 
 class Injector(nn.Module):
-    """What the transformer's tokens take from the pyramid."""
+    """Attention of the transformer's tokens to the pyramid."""
 
     def __init__(self, size: AdapterSize) -> None:
         super().__init__()
@@ -167,7 +167,7 @@ class ConvFfn(nn.Module):
 
 
 class Extractor(nn.Module):
-    """What the pyramid takes from the transformer's tokens."""
+    """Attention of the pyramid to the transformer's tokens."""
 
     def __init__(self, size: AdapterSize) -> None:
         super().__init__()
@@ -235,7 +235,7 @@ class ViTAdapter(nn.Module):
             raise InputError(f"network input of {height}x{width} pixels: expected multiples of {PATCH} and {COARSEST}")
         patches = (height // PATCH, width // PATCH)
         finest, *coarser = self.spm(picture)
-        grids = [grid_of_map(one) for one in coarser]
+        grids = [map_size(one) for one in coarser]
         pyramid = as_tokens([one + self.level_embed[i][:, None, None] for i, one in enumerate(coarser)])
         tokens = self.tokens(picture, patches)
         share = self.size.blocks // self.size.groups
@@ -255,7 +255,7 @@ class ViTAdapter(nn.Module):
         return torch.cat((cls, self.patch_embed(picture) + self.positions(patches)), dim=1)
 
     def positions(self, patches: Grid) -> Tensor:
-        """Of the patches, (1, rows * columns, D): bicubic to the size itself, unlike in the transformer alone."""
+        """Positions of the patches, (1, rows * columns, D), resized bicubically to this very size."""
         (learned,) = as_maps(self.pos_embed[:, 1:], [(GRID, GRID)])
         resized = F.interpolate(learned.float(), size=patches, mode="bicubic", align_corners=False)
         return as_tokens([resized]).to(self.pos_embed.dtype)

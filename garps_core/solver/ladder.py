@@ -18,8 +18,9 @@ import numpy as np
 
 from garps_core.config import Rung
 from garps_core.geometry import Array, displacement, se3_inverse, se3_log, skew
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import DeviceMixture, pair_up, thin, visible
-from garps_core.objective.shape import Evaluation, Pairs, unpack
+from garps_core.objective.shape import Evaluation, Pairs
 from garps_core.objective.state import State, WeightedStart
 from garps_core.objective.with_depth_errors import corrected, evaluate_at, two_sided
 from garps_core.solver.problem import Problem

@@ -11,6 +11,8 @@ from garps_core.config.combinations import check_start
 from garps_core.config.start import TWO_VIEW
 from garps_core.errors import InitialisationError, ModelError, WeightsError
 from garps_core.geometry import ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
+from garps_core.models.in_use import Networks
+from garps_core.point_maps import PairMaps
 from garps_core.start.descriptors import match_descriptors
 from garps_core.start.features import match_features
 from garps_core.start.match_pose import pose_from_matches
@@ -19,7 +21,12 @@ from garps_core.types import Prior, View
 
 
 def initialise(
-    source: View, target: View, config: Config | None = None, prior: Prior | None = None
+    source: View,
+    target: View,
+    config: Config | None = None,
+    prior: Prior | None = None,
+    networks: Networks | None = None,
+    maps: PairMaps | None = None,
 ) -> tuple[Prior, ...]:
     """Initial poses worth aligning from, each saying why (`Prior.origin`, `Prior.reason`).
 
@@ -27,6 +34,8 @@ def initialise(
     `start.features` is off); or identity if `start.identity_fallback`. Prior and features that contradict each other
     are two initial poses: the alignment has to tell which is right. "features" and "identity" do as they say and ignore
     a prior. A two-view network's pose is put together with a given prior as that of features is under "auto".
+    `networks` keeps what it loads for the next call; None = load what is needed for this call alone. `maps` is the
+    answer of the two-view network about this pair, where it has been asked before; None = it is asked here.
 
     Raises:
         InitialisationError: features fail and identity is not allowed; or the two-view network fails, has too little
@@ -38,7 +47,7 @@ def initialise(
     method = config.start.method
     if method in TWO_VIEW:
         check_start(config.start)
-        found = _by_network(source, target, config)
+        found = _by_network(source, target, config, networks or Networks(), maps)
         return (found,) if prior is None else combined(prior, found, config.start.max_contradiction)
     if method == "identity":
         return (identity(config, "asked for by start.method"),)
@@ -55,11 +64,9 @@ def initialise(
     return (found,) if prior is None or method == "features" else combined(prior, found, config.start.max_contradiction)
 
 
-def _by_network(source: View, target: View, config: Config) -> Prior:
-    from garps_core.models.two_view_in_use import pair_maps  # networks cost nothing where none is used
-
+def _by_network(source: View, target: View, config: Config, networks: Networks, maps: PairMaps | None) -> Prior:
     try:
-        maps = pair_maps(source.rgb, target.rgb, config)
+        maps = maps or networks.pair_maps(source.rgb, target.rgb, config)
     except WeightsError:
         raise
     except ModelError as failure:

@@ -9,6 +9,7 @@ from garps_core.checks import Float64Array
 from garps_core.config import Config
 from garps_core.errors import InitialisationError
 from garps_core.geometry import Array
+from garps_core.models.in_use import Networks
 from garps_core.point_maps import Bool, Framing, PairMaps, Picture, PointMap
 
 STEPS = 10
@@ -20,7 +21,9 @@ STEEPEST = 0.5 / SHORTEST
 """Slope of a ray that such a camera can see."""
 
 
-def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tuple[Array, Array]:
+def estimate_intrinsics(
+    source: Picture, target: Picture, config: Config, networks: Networks | None = None
+) -> tuple[Array, Array]:
     """3x3 K of two cameras nobody has calibrated, by the two-view network of `config.start`; see `intrinsics_of`.
 
     Give them to views with `K_estimated=True`, so that the estimate says so and its covariance is wider.
@@ -28,13 +31,12 @@ def estimate_intrinsics(source: Picture, target: Picture, config: Config) -> tup
     Args:
         source, target: HxWx3 uint8 RGB.
         config: `start.method` must be a two-view network.
+        networks: keeps what it loads for the next call; None = load what is needed for this call alone.
     Raises:
         InitialisationError: a map has hardly a point in front of its camera, or tells of no focal length there is.
-        ConfigError, WeightsError, ModelError: as `garps_core.models.two_view_in_use.pair_maps`.
+        ConfigError, WeightsError, ModelError: as `Networks.pair_maps`.
     """
-    from garps_core.models.two_view_in_use import pair_maps  # networks cost nothing where none is used
-
-    maps = pair_maps(source, target, config)
+    maps = (networks or Networks()).pair_maps(source, target, config)
     return intrinsics_of(maps, (source.shape[:2], target.shape[:2]), config.start.min_confidence)
 
 

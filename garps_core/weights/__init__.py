@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of weights: known, found, fetched, and read safely."""
+"""Files of weights: the list, the folder, fetching, and safe reading."""

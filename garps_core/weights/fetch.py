@@ -19,7 +19,7 @@ from garps_core.weights.verify import examined, verify
 
 @dataclass(frozen=True)
 class _Offer:
-    """What the hub says it has: the commit, bytes, and the hash of the file where it tells one."""
+    """A file on the hub: commit, bytes, and its hash where the hub tells one."""
 
     commit: str
     size: int
@@ -60,14 +60,14 @@ def fetch(name: str, accepted: str | None = None, say: Callable[[str], None] = p
 
 
 def by_hand(weights: Weights) -> str:
-    """What a person without the hub does to install the file."""
+    """Instructions for a person without the hub to install the file."""
     source = weights.url or f"{weights.file} of {weights.repo}"
     put = f"put it into {weights_folder()} as {weights.local}"
     return f"download {source}, {put}, then run `garps weights verify {weights.name}`"
 
 
 def page_of(weights: Weights) -> str:
-    """Where the licence can be read, as far as that is known."""
+    """Page on which the licence can be read, "" where there is none."""
     return f"hub repository {weights.repo}" if weights.repo else (weights.url or "")
 
 

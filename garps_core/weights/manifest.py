@@ -74,7 +74,7 @@ class Weights:
 
 
 def megabytes(count: float) -> int:
-    """Bytes of so many MB."""
+    """Bytes of a number of MB."""
     return round(count * 1e6)
 
 
@@ -184,7 +184,7 @@ _M2F = Weights(
 )
 
 ALL: tuple[Weights, ...] = (*_depth_anything(), _FLASH3D, *_dinov2(), _M2F, *_naver())
-"""Of each kind the smallest with the freest licence first."""
+"""All weights; within each kind the smallest with the freest licence comes first."""
 BY_NAME = {weights.name: weights for weights in ALL}
 
 
@@ -220,7 +220,7 @@ def range_of(file: str, metadata: Mapping[str, str], variant: str, option: str) 
         variant: indoor or outdoor, as the user says; "" = as the name or the metadata says.
         option: where the user says it.
     Raises:
-        WeightsError: nobody says it, they contradict each other, or the file is known to be of a relative model.
+        WeightsError: no source tells it, the sources contradict each other, or it is a relative model's file.
     """
     if re.fullmatch(r"depth_anything_v2_vit[sblg]\.(pth|safetensors)", file):
         raise WeightsError(f"{file} is the name of a relative model: expected a metric one, as in `garps weights list`")

@@ -41,7 +41,7 @@ _METADATA = re.compile(r"(_metadata|args|config|epoch|iteration|meta|optimi[sz]e
 
 @dataclass(frozen=True)
 class Tensors:
-    """What a weights file holds.
+    """Content of a weights file.
 
     Attributes:
         tensors: on the CPU, as stored; they may share memory with the file: copy before changing one.
@@ -103,7 +103,7 @@ def read_tensors(
 
 
 def regular_file(path: Path, folder: Path) -> Path:
-    """Where a path really leads, if that is a regular file, and inside the folder for a path in the folder."""
+    """Resolve a path to a regular file, which must lie inside the folder for a path in the folder."""
     try:
         real = path.resolve(strict=True)
         mode = real.stat().st_mode  # does not open it: opening a FIFO would wait for ever
@@ -202,7 +202,7 @@ _ODD = re.compile(r"(?:GLOBAL|class) ([\w.]+)")
 
 
 def _why(error: Exception) -> str:
-    """What stopped torch, in a few words; never its advice to load the file without protection."""
+    """The reason why torch stopped, in a few words; never its advice to load the file without protection."""
     odd = _ODD.search(str(error))
     if odd is None:
         return f"is no sound torch file ({type(error).__name__}): truncated or damaged; fetch it again"

@@ -62,12 +62,12 @@ def load_strictly(
 
 
 def recognised(tensors: Mapping[str, object]) -> str:
-    """What kind of file the names tell of, in words."""
+    """Kind of file that the names of the tensors tell of, in words."""
     return _told(tensors)[1]
 
 
 def kind_of(tensors: Mapping[str, object]) -> str:
-    """The same as `manifest.Weights.kind`, as far as that goes; empty when unknown.
+    """Kind of weights, as in `manifest.Weights.kind`; empty where the names do not tell it.
 
     The two heads on DINOv2 share their names and are told apart by width, since ade20k_ms sees four blocks; only 1536
     may be either.

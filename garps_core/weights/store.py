@@ -19,7 +19,7 @@ _MAX_BYTES = 2**20  # of that file
 
 @dataclass(frozen=True)
 class Record:
-    """What was found when a file was first used: its hash (64 hex digits), its size, and where it came from."""
+    """State of a file at its first use: hash (64 hex digits), size in bytes, and origin."""
 
     sha256: str
     bytes: int
@@ -66,7 +66,7 @@ def kinds() -> set[str]:
 
 
 def recorded(path: Path, folder: Path) -> Record | None:
-    """What was recorded of a file of the weights folder; None for one that is new, or elsewhere."""
+    """Return the record of a file of the weights folder; None for one that is new, or elsewhere."""
     if path.absolute().parent != folder.absolute():
         return None
     return _records(folder).get(path.name)

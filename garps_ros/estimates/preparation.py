@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is settled before the first pair, live and offline: whose depth it is, networks in_use, loops compiled."""
+"""Preparation before the first pair, live and offline: the source of depth, networks loaded, loops compiled."""
 
 from __future__ import annotations
 
@@ -10,26 +10,31 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from garps_core.align import estimate_relative_pose
-from garps_core.config import DEPTH_NETWORKS, Config, Reconstruction
+from garps_core.align import Estimator
+from garps_core.config import Config, Reconstruction, depth_networks
 from garps_core.config.combinations import check_settings, check_start
 from garps_core.config.lifting import Lifting
 from garps_core.config.start import TWO_VIEW, Start
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
+from garps_core.models.depth_networks import with_weights
+from garps_core.models.in_use import Networks
 from garps_core.objective import compiled
 from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
-NETWORKS = (*DEPTH_NETWORKS, "flash3d", "two_view")
-"""Methods that ask a network for depth; the others need the sensor's."""
 LONG_S = 2.0
-"""Compiled loops that are read from where they were kept take less; more is worth a line."""
+"""Time of compiling beyond which a line is logged, s; loops that are read from the cache take less."""
+
+
+def methods_without_sensor() -> tuple[str, ...]:
+    """Return the methods that ask a network for depth; the others need the sensor's."""
+    return *depth_networks(), "flash3d", "two_view"
 
 
 def needs_depth(config: Config) -> bool:
     """Whether every image needs the sensor's depth; where a network gives it, the sensor's is left alone."""
-    return config.reconstruction.method not in NETWORKS
+    return config.reconstruction.method not in methods_without_sensor()
 
 
 def check_method(config: Config) -> None:
@@ -37,16 +42,16 @@ def check_method(config: Config) -> None:
     if config.reconstruction.method == "ply":
         raise ConfigError(
             "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network "
-            f"({', '.join(NETWORKS)}) for images on topics; `garps align a.ply b.ply` takes files"
+            f"({', '.join(methods_without_sensor())}) for images on topics; `garps align a.ply b.ply` takes files"
         )
     check_start(config.start)
     if not needs_depth(config):
         check_settings(config)
 
 
-def completed(view: View, config: Config) -> View:
-    """A view by itself with what its mixture needs; a two-view network gives nothing before it sees a pair."""
-    return view if config.reconstruction.method == "two_view" else with_depth([view], config)[0]
+def completed(view: View, config: Config, networks: Networks) -> View:
+    """Return a view with the depth that its mixture needs. A two-view network gives none before it sees a pair."""
+    return view if config.reconstruction.method == "two_view" else with_depth([view], config, networks)[0]
 
 
 def depth_share(config: Config) -> float:
@@ -56,12 +61,12 @@ def depth_share(config: Config) -> float:
 
 def settings_of_completed(config: Config) -> Config:
     """The settings for views that are `completed` already: a network's depth then counts as given."""
-    of_network = config.reconstruction.method in DEPTH_NETWORKS
+    of_network = config.reconstruction.method in depth_networks()
     return config.replace({"reconstruction.method": "rgbd"} if of_network else {})
 
 
 def scale_from(config: Config) -> str:
-    """Where metres come from, for people. Raises WeightsError where the settings' weights are not installed."""
+    """Return the source of metres, for people. Raises WeightsError where the settings' weights are not installed."""
     if needs_depth(config):
         return "the depth topics, m"
     from garps_core.weights.store import default  # networks cost nothing where none is used
@@ -69,13 +74,7 @@ def scale_from(config: Config) -> str:
     settings = config.reconstruction
     if settings.method == "two_view":
         return f"{two_view_name(config)} of every pair, m"
-    if settings.method == "demo_net":
-        from garps_core.models.demo_net import WHAT_IT_IS
-
-        return f"demo_net ({WHAT_IT_IS}), m"
-    variant = "" if settings.scene == "any" else settings.scene
-    weights = settings.depth_weights or default("depth_anything", variant).name
-    found = f"depth_anything_v2 (weights {weights}), m"
+    found = f"{with_weights(settings)}, m"
     if settings.method == "flash3d":
         found = f"flash3d (weights {settings.flash3d_weights or default('flash3d').name}) on {found}"
     return found
@@ -91,8 +90,8 @@ def two_view_name(config: Config) -> str:
     return f"{start.method} (weights {start.weights or default(start.method).name})"
 
 
-def load_networks(config: Config, say: Callable[[str], None]) -> None:
-    """Load the networks that the settings name, if any, and say what it took.
+def load_networks(config: Config, say: Callable[[str], None], networks: Networks) -> None:
+    """Load the networks that the settings name, if any, into `networks`, and say what it took.
 
     Raises:
         WeightsError: weights that are not installed, or not what they should be.
@@ -102,22 +101,17 @@ def load_networks(config: Config, say: Callable[[str], None]) -> None:
     two_view = config.start.method in TWO_VIEW
     if needs_depth(config) and settings.semantics == "none" and not two_view:
         return
-    from garps_core.models import in_use
-
     if two_view:
-        from garps_core.models.two_view_in_use import two_view_model
-
         names.append(two_view_name(config))
-        two_view_model(config)
+        networks.two_view(config)
     if not needs_depth(config) and settings.method != "two_view":
         names.append(scale_from(config).removesuffix(", m"))
-        in_use.on_device(in_use.depth_network_of(settings), config.device)
+        networks.depth_network(config)
     if settings.method == "flash3d":
-        in_use.flash3d(settings.flash3d_weights, config.device)
+        networks.flash3d(config)
     if settings.semantics != "none":
         names.append(f"labels ({settings.semantics})")
-        segmenter = in_use.segmenter(settings.semantics, settings.semantic_weights, settings.semantic_backbone)
-        in_use.on_device(segmenter, config.device)
+        networks.segmenter(config)
     say(f"loaded {' and '.join(names)} in {time.perf_counter() - begin:.1f} s")
 
 
@@ -131,7 +125,7 @@ def warm_up(config: Config, say: Callable[[str], None]) -> None:
     begin, view = time.perf_counter(), _corner()
     # Own settings but for what could leave nothing of so small a picture.
     tiny = replace(config, reconstruction=Reconstruction(method="rgbd"), lifting=Lifting(), start=Start())
-    estimate_relative_pose(view, view, tiny, Prior(np.eye(4), np.eye(6) * 1e-4))
+    Estimator(tiny).estimate(view, view, Prior(np.eye(4), np.eye(6) * 1e-4))
     if (spent := time.perf_counter() - begin) > LONG_S:
         say(f"compiled the innermost loops in {spent:.1f} s; where they can be kept, the next start is quick")
 

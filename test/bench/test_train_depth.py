@@ -10,7 +10,7 @@ from bench.train_depth import Training, folded, loss_of, rate_at
 from bench.training.pictures import batches
 from bench.training.rooms import shots
 from garps_core import View
-from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, depth_of
+from garps_core.models.demo_net import HEIGHT, WIDTH, DemoNet, depth_of_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STEPS = 4
@@ -107,6 +107,6 @@ def test_it_fits_into_the_package_and_knows_the_focal_length(few):
     rgb = np.zeros((240, 320, 3), np.uint8)
     with torch.no_grad():
         network.answer.weight.zero_()
-    near, far = depth_of(network, [View(rgb, K), View(rgb, K * [[2, 2, 1], [2, 2, 1], [1, 1, 1]])])
+    near, far = depth_of_views(network, [View(rgb, K), View(rgb, K * [[2, 2, 1], [2, 2, 1], [1, 1, 1]])])
     assert near.shape == (240, 320) and near.dtype == np.float32
     assert far == pytest.approx(2 * near)

@@ -31,7 +31,7 @@ PUBLIC = {
     "View": ["rgb", "K", "depth", "stamp_ns", "frame_id", "K_estimated"],
     "align_mixtures": ["source", "target", "initial", "config"],
     "estimate_relative_pose": ["source", "target", "config", "prior"],
-    "reconstruct": ["view", "config"],
+    "reconstruct": ["view", "config", "networks"],
 }  # fmt: skip
 MEANT_SENSOR = {"lifting.noise_floor_m": 1e-3, "lifting.noise_linear": 0.0, "lifting.noise_quadratic_per_m": 2e-3}
 
@@ -85,7 +85,7 @@ def test_an_estimate_is_complete(estimate):
     np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     assert set(estimate.seconds) == {"reconstruct", "initialise", "align"}
-    assert all(0 < seconds < 60 for seconds in estimate.seconds.values())
+    assert all(seconds > 0 for seconds in estimate.seconds.values())
     assert 0 < estimate.overlap <= 1 and estimate.iterations > 0 and np.isfinite(estimate.objective)
     assert "converged in" in estimate.reason and "\n" not in estimate.reason
 
@@ -257,10 +257,10 @@ def test_cuda_that_is_not_there_is_named():
 
 def lounge_pairs():
     """Three pairs of a recorded RGB-D camera; skipped where the recordings are not."""
-    datasets = pytest.importorskip("bench.pairs.datasets")
-    if "hololens_lounge" not in datasets.available(DATA):
+    pairs_json = pytest.importorskip("bench.pairs.readers.pairs_json")
+    if "hololens_lounge" not in pairs_json.available(DATA):
         pytest.skip(f"no recorded pairs in {DATA}/dev/hololens_lounge")
-    return datasets.load_pairs("hololens_lounge", DATA, limit=3)
+    return pairs_json.load_pairs("hololens_lounge", DATA, limit=3)
 
 
 def test_recorded_pairs_from_features():
@@ -273,9 +273,9 @@ def test_recorded_pairs_from_features():
 
 
 def test_recorded_pairs_from_a_disturbed_truth():
-    datasets = pytest.importorskip("bench.pairs.datasets")
+    starts = pytest.importorskip("bench.pairs.starts")
     for pair in lounge_pairs():
-        prior = datasets.disturbed_prior(pair)
+        prior = starts.disturbed_prior(pair)
         start = translation_error_m(prior.T_target_source, pair.T_target_source)
         estimate = estimate_relative_pose(pair.source, pair.target, prior=prior)
         assert estimate.T_target_source is not None, f"{pair.id}: {estimate.reason}"

@@ -16,12 +16,14 @@ from garps_core import (
     Mixture,
     Prior,
     ReconstructionError,
+    Status,
     View,
     align_mixtures,
     estimate_relative_pose,
 )
 from garps_core.config import Alignment, Rung
 from garps_core.config.lifting import Lifting
+from garps_core.errors import MissingDepthError
 from garps_core.mixtures.reconstruct import reconstruct
 
 RGB = np.zeros((48, 64, 3), np.uint8)
@@ -165,8 +167,14 @@ SETTINGS = {
         lambda: Config().replace({"lifting.strid": 4}),
         "'lifting.strid' does not exist; did you mean 'lifting",
     ),
-    "no part": (lambda: Config().replace({"information": 4}), "did you mean 'alignment.effective_measurements'"),
-    "nothing like it": (lambda: Config().replace({"zzzzzz": 4}), "'zzzzzz' does not exist; expected one of the names"),
+    "no part": (
+        lambda: Config().replace({"effective_measurements": 4}),
+        "did you mean 'alignment.effective_measurements'",
+    ),
+    "nothing like it": (
+        lambda: Config().replace({"zzzzzz": 4}),
+        "'zzzzzz' does not exist; expected a name of docs/param",
+    ),
     "below a leaf": (lambda: Config().replace({"seed.value": 4}), "setting 'seed.value' does not exist"),
     "below range": (
         lambda: Config().replace({"lifting.stride": 0}),
@@ -210,11 +218,16 @@ SETTINGS = {
     ),
 }
 
-RECONSTRUCTIONS = {
+WITHOUT_DEPTH = {
     "no depth": (
         lambda: reconstruct(view(depth=None)),
         r"the view has no depth: expected .*; give View\(\.\.\., depth=",
     ),
+    "pipeline, source": (lambda: estimate_relative_pose(view(depth=None), view()), "the view has no depth: expected"),
+    "pipeline, target": (lambda: estimate_relative_pose(view(), view(depth=None)), "the view has no depth: expected"),
+}
+
+RECONSTRUCTIONS = {
     "all NaN": (
         lambda: reconstruct(view(depth=DEPTH * np.nan)),
         r"0 usable depth pixels of 3072 \(0 with a reading\): expected at least 50; check",
@@ -229,8 +242,6 @@ RECONSTRUCTIONS = {
         lambda: reconstruct(view(depth=np.where(np.arange(64) % 2, 2, 4) * np.ones((48, 1), np.float32))),
         r"0 usable .* \(3072 with a reading\): .*the scene is not one edge",
     ),
-    "pipeline, source": (lambda: estimate_relative_pose(view(depth=None), view()), "the view has no depth: expected"),
-    "pipeline, target": (lambda: estimate_relative_pose(view(), view(depth=None)), "the view has no depth: expected"),
 }
 
 CASES = {
@@ -238,6 +249,7 @@ CASES = {
     for kind, table in (
         (InputError, {**VIEWS, **{f"prior {n}": c for n, c in PRIORS.items()}, **MIXTURES}),
         (ConfigError, SETTINGS),
+        (MissingDepthError, WITHOUT_DEPTH),
         (ReconstructionError, RECONSTRUCTIONS),
     )
     for name, (make, match) in table.items()
@@ -257,8 +269,18 @@ def test_what_cannot_be_right_is_refused_by_name(name):
 
 
 def test_the_table_is_the_size_it_claims():
-    tables = (VIEWS, PRIORS, MIXTURES, SETTINGS, RECONSTRUCTIONS)
+    tables = (VIEWS, PRIORS, MIXTURES, SETTINGS, WITHOUT_DEPTH, RECONSTRUCTIONS)
     assert len(CASES) == sum(map(len, tables)) >= 85, "a name was used twice"
+
+
+@pytest.mark.parametrize("depth", [DEPTH * np.nan, DEPTH * 0, DEPTH * 20], ids=["unknown", "zero", "out of range"])
+@pytest.mark.parametrize("side", [0, 1], ids=["source", "target"])
+def test_a_pair_with_too_little_depth_is_a_status(depth, side):
+    views = [look(), look()]
+    views[side] = view(depth=depth)
+    estimate = estimate_relative_pose(*views)
+    assert (estimate.status, estimate.ok, estimate.T_target_source) == (Status.NO_MIXTURE, False, None)
+    assert "the view has 0 usable depth pixels of 3072" in estimate.reason
 
 
 def test_the_parts_the_bad_cases_are_made_of_are_good():

@@ -17,11 +17,13 @@ from places import ROOT
 from garps_core import Config, View, estimate_relative_pose, metrics
 from garps_core.cli import command
 from garps_core.cli.doctor import examine
-from garps_core.config import DEPTH_NETWORKS, PRESETS, preset_for
+from garps_core.config import PRESETS, depth_networks
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.mixtures.reconstruct import with_depth
-from garps_core.models import demo_net, in_use
-from garps_core.models.demo_net import DemoNet, depth_of, prepared, shipped
+from garps_core.models import demo_net
+from garps_core.models.demo_net import DemoNet, demo_input, depth_of_views, shipped
+from garps_core.models.depth_networks import preset_for
+from garps_core.models.in_use import Networks
 from garps_core.weights.reader import read_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,7 +56,7 @@ def test_it_is_small() -> None:
 
 
 def test_the_package_with_it_stays_small(tmp_path: Path) -> None:
-    """As a wheel holds it: all of the three packages, compressed."""
+    """The three packages, compressed as in a wheel."""
     with zipfile.ZipFile(tmp_path / "all.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for package in ("garps_core", "garps_ros", "msg_adapters"):
             for path in (ROOT / package).rglob("*"):
@@ -72,7 +74,9 @@ def test_the_file_says_how_it_was_made() -> None:
 def test_it_knows_rooms_it_has_not_seen_better_than_a_guess(network: DemoNet, rooms) -> None:
     errors, guessed = [], []
     for pair in rooms:
-        for found, true in zip(depth_of(network, views_of(pair)), (pair.true_depth0, pair.true_depth1), strict=True):
+        for found, true in zip(
+            depth_of_views(network, views_of(pair)), (pair.true_depth0, pair.true_depth1), strict=True
+        ):
             assert found.shape == true.shape and found.dtype == np.float32
             errors.append(float(np.nanmean(np.abs(found - true) / true)))
             guessed.append(float(np.nanmean(np.abs(np.nanmedian(true) - true) / true)))  # even told the median
@@ -81,7 +85,7 @@ def test_it_knows_rooms_it_has_not_seen_better_than_a_guess(network: DemoNet, ro
 
 def test_pairs_and_single_views_agree(network: DemoNet, rooms) -> None:
     source, target = views_of(rooms[0])
-    together, alone = depth_of(network, [source, target]), depth_of(network, [source])
+    together, alone = depth_of_views(network, [source, target]), depth_of_views(network, [source])
     np.testing.assert_allclose(together[0], alone[0], rtol=1e-5)
     assert not np.allclose(together[0], together[1], rtol=0.01)
 
@@ -93,14 +97,14 @@ def test_other_pixels_for_the_same_camera_give_the_same_depth(network: DemoNet, 
     K = source.K.copy()
     K[:2, :2] /= 2
     K[:2, 2] = (source.K[:2, 2] + 0.5) / 2 - 0.5
-    whole, half = (depth_of(network, [view])[0] for view in (source, View(rgb, K)))
+    whole, half = (depth_of_views(network, [view])[0] for view in (source, View(rgb, K)))
     ratio = cv2.resize(whole, half.shape[::-1], interpolation=cv2.INTER_AREA) / half
     assert np.median(ratio) == pytest.approx(1, abs=0.02) and np.percentile(np.abs(ratio - 1), 90) < 0.05
 
 
 def test_rays_lie_where_the_intrinsics_say() -> None:
     K = np.array([[400.0, 0, 319.5], [0, 410.0, 239.5], [0, 0, 1]])
-    found, focal = prepared(np.zeros((480, 640, 3), np.uint8), K)
+    found, focal = demo_input(np.zeros((480, 640, 3), np.uint8), K)
     assert found.shape == (5, 192, 256) and found.dtype == np.float32
     assert found[3].mean() == pytest.approx(0, abs=1e-6) and found[4].mean() == pytest.approx(0, abs=1e-6)
     assert found[3, 0, -1] == pytest.approx((639 - 0.75 - 319.5) / 400, abs=1e-6)  # its centre is 2.5 px wide
@@ -111,7 +115,7 @@ def test_rays_lie_where_the_intrinsics_say() -> None:
 def test_elongated_pictures_are_refused(network: DemoNet, shape: tuple[int, int]) -> None:
     K = np.array([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
     with pytest.raises(InputError, match=f"rgb is {shape[1]}x{shape[0]}: expected sides within a factor of 3"):
-        depth_of(network, [View(np.zeros((*shape, 3), np.uint8), K)])
+        depth_of_views(network, [View(np.zeros((*shape, 3), np.uint8), K)])
 
 
 def test_depth_that_is_not_finite_is_an_error(rooms) -> None:
@@ -119,7 +123,7 @@ def test_depth_that_is_not_finite_is_an_error(rooms) -> None:
     with torch.no_grad():
         broken.answer.bias.fill_(float("nan"))
     with pytest.raises(ModelError, match="not finite"):
-        depth_of(broken, views_of(rooms[0]))
+        depth_of_views(broken, views_of(rooms[0]))
 
 
 def test_a_file_that_is_not_it_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +138,7 @@ def test_a_file_that_is_not_it_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_nothing_takes_it_but_who_asks_for_it(rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # nothing is installed
-    assert "demo_net" in DEPTH_NETWORKS
+    assert "demo_net" in depth_networks()
     naming = [name for name in PRESETS if Config.preset(name).reconstruction.method == "demo_net"]
     assert naming == ["demo_net"]
     for preset in ("monocular", "paper"):
@@ -157,7 +161,7 @@ def test_it_is_called_a_demonstration(
 ) -> None:
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))  # loaded anew
     with caplog.at_level(logging.WARNING, "garps_core"):
-        assert isinstance(in_use.demonstration(), DemoNet)
+        assert isinstance(Networks().depth_network(Config.preset("demo_net")), DemoNet)
     assert f"demo_net is {DEMONSTRATION}" in caplog.text
     rows, _ = examine()
     assert DEMONSTRATION in dict(rows)["demo_net"]
@@ -202,7 +206,7 @@ def test_depth_that_comes_with_the_view_is_left_alone_only_without_it(rooms) -> 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_gpu_gives_the_same_depth(rooms) -> None:
     views = views_of(rooms[0])
-    here = depth_of(shipped(), views)
-    there = depth_of(shipped().to("cuda"), views)
+    here = depth_of_views(shipped(), views)
+    there = depth_of_views(shipped().to("cuda"), views)
     for a, b in zip(here, there, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3)

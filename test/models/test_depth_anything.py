@@ -9,18 +9,18 @@ from golden_rule import IMAGENET, chw, compare, image, keys, state
 
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
 from garps_core.models import depth_anything
-from garps_core.models.depth_anything import HEADS, DepthAnythingV2, built_from, depth_of, from_transformers
+from garps_core.models.depth_anything import HEADS, DepthAnythingV2, built_from, depth_of_images, from_transformers
 from garps_core.models.vit import SIZES, VisionTransformer
 from garps_core.models.vit import from_transformers as backbone_from_transformers
 
 NAME, HF = "dav2_vits_metric", "dav2_vits_metric_hf"
 SMALL = (60, 80)
-"""Of pictures for tests of what does not depend on their size; the network's side is made small, too."""
+"""Size of pictures where the test does not depend on it; the network's side is made small, too."""
 
 
 @pytest.fixture(scope="module")
 def tensors():
-    """Of the official file."""
+    """Tensors of the official file."""
     return {key: torch.from_numpy(value) for key, value in state(NAME).items()}
 
 
@@ -36,7 +36,7 @@ def small_side(monkeypatch):
 
 
 def hf_tensors(tensors, new=False):
-    """The same parameters in the `transformers` layout, `new` with the attention's newer names."""
+    """Parameters in the `transformers` layout, `new` with the attention's newer names."""
     held = {}
     for key, _, official, *rows in keys(HF)["files"]["model"]:
         if new:
@@ -102,8 +102,8 @@ def test_golden_values_on_the_learned_grid(model):
 def test_golden_values_from_a_picture_to_its_depth(model):
     rgb = image(240, 320)
     size = depth_anything.network_size(rgb)
-    (depth,) = depth_of(model, [rgb])
-    ours = {"infer240x320.tensor": depth_anything.prepared(rgb, size)[None], "infer240x320.out.depth": depth}
+    (depth,) = depth_of_images(model, [rgb])
+    ours = {"infer240x320.tensor": depth_anything.resized_input(rgb, size)[None], "infer240x320.out.depth": depth}
     assert len(compare(NAME, ours)) == 2
     assert depth.dtype == np.float32
 
@@ -199,7 +199,7 @@ def test_the_picture_is_resized_before_it_is_rounded(size):
     """Against OpenCV on normalised numbers, which commutes with the resize; overshoot is kept."""
     rgb = np.where(image(*size) > 127, 255, 0).astype(np.uint8)
     target = depth_anything.network_size(rgb)
-    ours = depth_anything.prepared(rgb, target).numpy()
+    ours = depth_anything.resized_input(rgb, target).numpy()
     normalised = (rgb / 255.0 - IMAGENET[0]) / IMAGENET[1]
     theirs = cv2.resize(normalised, target[::-1], interpolation=cv2.INTER_CUBIC).transpose(2, 0, 1)
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -211,25 +211,25 @@ def test_two_pictures_of_one_size_share_a_pass_and_others_do_not(model, small_si
     rgb = [image(*SMALL), image(*SMALL[::-1]), image(*SMALL, x0=40)]
     passes = []
     hook = model.register_forward_pre_hook(lambda _, given: passes.append(tuple(given[0].shape)))
-    together = depth_of(model, rgb)
+    together = depth_of_images(model, rgb)
     hook.remove()
     assert passes == [(2, 3, 70, 98), (1, 3, 98, 70)]
-    alone = [depth_of(model, [one])[0] for one in rgb]
+    alone = [depth_of_images(model, [one])[0] for one in rgb]
     for one, other, given in zip(together, alone, rgb, strict=True):
         assert one.shape == given.shape[:2]
         np.testing.assert_allclose(one, other, atol=2e-3)
     assert np.abs(together[0] - together[2]).max() > 0.1
-    assert depth_of(model, []) == []
+    assert depth_of_images(model, []) == []
 
 
 def test_scale_and_focal_length_multiply_depth(model, small_side):
     rgb = [image(*SMALL)]
-    (plain,) = depth_of(model, rgb)
-    (scaled,) = depth_of(model, rgb, depth_scale=1.25)
-    (corrected,) = depth_of(model, rgb, fx=[80 * 0.5])
+    (plain,) = depth_of_images(model, rgb)
+    (scaled,) = depth_of_images(model, rgb, depth_scale=1.25)
+    (corrected,) = depth_of_images(model, rgb, fx=[80 * 0.5])
     np.testing.assert_allclose(scaled, 1.25 * plain, rtol=1e-6)
     np.testing.assert_allclose(corrected, np.tan(np.radians(30)) * plain, rtol=1e-6)
-    same, half = depth_of(model, rgb * 2, fx=[40 / np.tan(np.radians(30)), 20 / np.tan(np.radians(30))])
+    same, half = depth_of_images(model, rgb * 2, fx=[40 / np.tan(np.radians(30)), 20 / np.tan(np.radians(30))])
     np.testing.assert_allclose(same, plain, atol=2e-3)
     np.testing.assert_allclose(half, 0.5 * plain, atol=2e-3)
 
@@ -238,10 +238,10 @@ def test_scale_and_focal_length_multiply_depth(model, small_side):
     ("dtype", "bound"), [(torch.bfloat16, 0.01), (torch.float16, 0.002)], ids=["bfloat16", "float16"]
 )
 def test_what_half_precision_costs(model, monkeypatch, dtype, bound):
-    """With pseudo-random weights: an upper bound of order, since depth there varies over a pixel as it never will."""
+    """An upper bound of order: with pseudo-random weights depth varies over a pixel as it never will."""
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 140)
     rgb = [image(120, 160)]
-    (full,), (half,) = depth_of(model, rgb), depth_of(model, rgb, dtype=dtype)
+    (full,), (half,) = depth_of_images(model, rgb), depth_of_images(model, rgb, dtype=dtype)
     error = np.abs(half / full - 1)
     print(f"{dtype}: median {np.median(error):.2%}, 99 % {np.quantile(error, 0.99):.2%}, max {error.max():.2%}")
     assert half.dtype == np.float32
@@ -263,23 +263,23 @@ BAD_IMAGES = {
 @pytest.mark.parametrize(("given", "message"), BAD_IMAGES.values(), ids=BAD_IMAGES)
 def test_pictures_that_cannot_be_are_refused(model, given, message):
     with pytest.raises(InputError, match=message):
-        depth_of(model, [image(*SMALL), given])
+        depth_of_images(model, [image(*SMALL), given])
 
 
 @pytest.mark.parametrize("fx", [[100.0], [100.0, 0.0], [100.0, float("nan")], [-1.0, 100.0]])
 def test_focal_lengths_that_cannot_be_are_refused(model, fx):
     with pytest.raises(InputError, match="for 2 images: expected one positive"):
-        depth_of(model, [image(*SMALL)] * 2, fx=fx)
+        depth_of_images(model, [image(*SMALL)] * 2, fx=fx)
 
 
 def test_settings_that_cannot_be_are_refused(model):
     for scale in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(ConfigError, match="depth_scale"):
-            depth_of(model, [image(*SMALL)], depth_scale=scale)
+            depth_of_images(model, [image(*SMALL)], depth_scale=scale)
     with pytest.raises(ConfigError, match="device is 'gpu'"):
-        depth_of(model, [image(*SMALL)], device="gpu")
+        depth_of_images(model, [image(*SMALL)], device="gpu")
     with pytest.raises(ConfigError, match=r"torch\.int8.*float16"):
-        depth_of(model, [image(*SMALL)], dtype=torch.int8)
+        depth_of_images(model, [image(*SMALL)], dtype=torch.int8)
 
 
 def out_of_memory_above(limit):
@@ -296,10 +296,10 @@ def test_where_two_do_not_fit_in_memory_one_by_one_do(model, small_side):
     rgb = [image(*SMALL), image(*SMALL, x0=40)]
     hook = model.register_forward_pre_hook(out_of_memory_above(1))
     try:
-        found = depth_of(model, rgb)
+        found = depth_of_images(model, rgb)
     finally:
         hook.remove()
-    for one, other in zip(found, depth_of(model, rgb), strict=True):
+    for one, other in zip(found, depth_of_images(model, rgb), strict=True):
         np.testing.assert_allclose(one, other, atol=2e-3)
 
 
@@ -307,7 +307,7 @@ def test_where_not_even_one_fits_in_memory_the_error_says_so(model, small_side):
     hook = model.register_forward_pre_hook(out_of_memory_above(0))
     try:
         with pytest.raises(ModelError, match="out of memory on cpu with one image of 98x70"):
-            depth_of(model, [image(*SMALL)])
+            depth_of_images(model, [image(*SMALL)])
     finally:
         hook.remove()
 
@@ -315,13 +315,13 @@ def test_where_not_even_one_fits_in_memory_the_error_says_so(model, small_side):
 def test_depth_that_is_no_number_is_an_error(tensors, small_side):
     damaged = built_from(tensors | {"pretrained.norm.bias": torch.full((384,), 3e38)}, 20.0)
     with pytest.raises(ModelError, match=r"NaN or infinity in torch\.float32"):
-        depth_of(damaged, [image(*SMALL)])
+        depth_of_images(damaged, [image(*SMALL)])
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_gives_the_same_depth(tensors, small_side):
     rgb = [image(*SMALL)]
-    (here,) = depth_of(built_from(tensors, 20.0), rgb)
-    (there,) = depth_of(built_from(tensors, 20.0), rgb, device="cuda")
+    (here,) = depth_of_images(built_from(tensors, 20.0), rgb)
+    (there,) = depth_of_images(built_from(tensors, 20.0), rgb, device="cuda")
     np.testing.assert_allclose(there, here, rtol=0.02)

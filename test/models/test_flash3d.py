@@ -74,7 +74,7 @@ def test_what_comes_out_is_what_was_published(run: tuple[Arrays, Flash3DGaussian
 
 
 def test_every_tensor_of_the_published_network_is_met(network: Flash3D) -> None:
-    """In float64: how a processor sums 20 000 products in float32 moves some of them by more than the tolerance."""
+    """Compare in float64: the order of sums of 20 000 products in float32 moves some by more than the tolerance."""
     exact = copy.deepcopy(network).double()
     seen: Arrays = {}
 

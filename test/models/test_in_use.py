@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 import torch
 from box_room import K_WORDS, START, TRUTH
-from network_weights import GOLDEN, install, pair, passes, write_pair
+from network_weights import GOLDEN, install, pair, passes, shared, write_pair
 from small_mask2former import ADAPTER, HEAD, random_state
 
 from garps_core import Config, Prior, align_mixtures, metrics
 from garps_core.cli import command
 from garps_core.geometry import se3_exp
-from garps_core.mixtures import reconstruct
 from garps_core.mixtures.flash3d import labels_of, predict_gaussians
-from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, with_depth
+from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, reconstruct, with_depth
 from garps_core.mixtures.splat_writer import write_splats
-from garps_core.models import depth_anything, in_use
+from garps_core.models import depth_anything
 from garps_core.models.flash3d import PADDED
 from garps_core.models.mask2former import Mask2Former
 from garps_core.models.semantics import segment
@@ -46,7 +45,11 @@ def installed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    return in_use.depth_network("", "any"), in_use.flash3d("", "cpu")
+    return shared().depth_network(FLASH3D), shared().flash3d(FLASH3D)
+
+
+def labelling(head: str, backbone: str = "") -> Config:
+    return Config().replace({"reconstruction.semantics": head, "reconstruction.semantic_backbone": backbone})
 
 
 def test_two_pictures_by_flash3d(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
@@ -81,7 +84,7 @@ def test_two_pictures_by_the_depth_network_alone(files: dict[str, str], capsys: 
 
 
 def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captured) -> None:
-    """Even with pseudo-random offsets around it, the pose is near the truth then."""
+    """The pose is near the truth even with pseudo-random offsets around the depth."""
     depths = ["--depth-source", files["a_mm"], "--depth-target", files["b_mm"]]
     with passes(networks()[0]) as of_depth:
         command.main(["align", files["a"], files["b"], *K_WORDS, *depths, "--reconstruction", "flash3d", "--json"])
@@ -113,8 +116,8 @@ def test_mistakes_are_one_line(files: dict[str, str], words: list[str], message:
 @pytest.mark.parametrize("head", ["linear", "ms"])
 def test_a_lifted_component_has_the_label_of_its_pixel(head: str) -> None:
     (view,) = pair(depth=True)[:1]
-    mixture = reconstruct(view, Config().replace({"reconstruction.semantics": head}))
-    labels = segment(in_use.segmenter(head, "", ""), view.rgb)
+    mixture = reconstruct(view, labelling(head), shared())
+    labels = segment(shared().segmenter(labelling(head)), view.rgb)
     assert len(np.unique(labels)) > 1 and labels.shape == view.rgb.shape[:2]
     pixels = mixture.means[:, :2] / mixture.means[:, 2:] * (view.K[0, 0], view.K[1, 1]) + view.K[:2, 2]
     column, row = np.rint(pixels).astype(int).T
@@ -123,16 +126,16 @@ def test_a_lifted_component_has_the_label_of_its_pixel(head: str) -> None:
 
 
 def test_both_gaussians_of_a_pixel_have_its_label() -> None:
-    """In the order that the published solver needs, where each component is told from its place in the list."""
+    """Components come in the order of the published solver, which tells them by their place in the list."""
     changes = {"reconstruction.method": "flash3d", "reconstruction.semantics": "linear", "lifting.max_range_m": 1000.0}
     config = Config.preset("paper").replace(changes)
-    (view,) = with_depth(pair()[:1], config)
-    mixture = mixture_of(view, config)
-    gaussians = predict_gaussians(in_use.flash3d("", "cpu"), view)
+    (view,) = with_depth(pair()[:1], config, shared())
+    mixture = mixture_of(view, config, shared())
+    gaussians = predict_gaussians(shared().flash3d(config), view)
     kept = (gaussians.means[:, 2] >= config.lifting.min_range_m) & (gaussians.opacities >= 1 / 255)
     np.testing.assert_array_equal(mixture.means, gaussians.means[kept])
     pixel = gaussians.index[kept] % (PADDED[0] * PADDED[1])
-    expected = labels_of(segment(in_use.segmenter("linear", "", ""), view.rgb), view, pixel)
+    expected = labels_of(segment(shared().segmenter(config), view.rgb), view, pixel)
     np.testing.assert_array_equal(mixture.labels, expected)
     of_pixel = np.full(PADDED[0] * PADDED[1], -1)
     of_pixel[pixel] = mixture.labels
@@ -145,7 +148,7 @@ def test_different_labels_count_for_less_where_there_are_labels(method: str) -> 
     start, found = Prior(TRUTH, 1e-4 * np.eye(6)), {}
     for semantics in ("none", "ms"):
         config = Config().replace({"reconstruction.method": method, "reconstruction.semantics": semantics})
-        x, y = mixtures_of(pair(depth=True), config)
+        x, y = mixtures_of(pair(depth=True), config, shared())
         for discount in (1.0, 0.1):
             changed = config.replace({"alignment.semantic_discount": discount})
             found[semantics, discount] = align_mixtures(x, y, start, changed).objective
@@ -154,15 +157,15 @@ def test_different_labels_count_for_less_where_there_are_labels(method: str) -> 
 
 
 def test_heads_take_the_backbone_that_is_there(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under either of its names, or a file."""
+    """The backbone has two names, and may be a file."""
     for name in ("dinov2_vits14_ade20k_linear_head.pth", "dinov2-small-hf.safetensors"):
         (tmp_path / name).write_bytes(
             (weights / name.replace("-small-hf.safetensors", "_vits14_pretrain.pth")).read_bytes()
         )
     monkeypatch.setenv("GARPS_WEIGHTS", str(tmp_path))
-    assert in_use.segmenter("linear", "", "").taps == (11,)
+    assert shared().segmenter(labelling("linear")).taps == (11,)
     file = str(weights / "dinov2_vits14_pretrain.pth")
-    assert in_use.segmenter("linear", "", file).taps == (11,)
+    assert shared().segmenter(labelling("linear", file)).taps == (11,)
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +220,7 @@ def test_splats_and_pictures_do_not_mix(
 
 
 def test_the_published_pipeline_is_one_command(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
-    """Up to its mixtures; with a reduced Mask2Former, since the published one has gigabytes."""
+    """It is run up to its mixtures, with a reduced Mask2Former, since the published one has gigabytes."""
     published = ["--preset", "paper", "--reconstruction", "flash3d", "--set", "reconstruction.semantics=m2f"]
     assert command.main(["align", files["a"], files["b"], *K_WORDS, *published]) == 2
     assert "download it from https://dl.fbaipublicfiles.com/dinov2/dinov2_vitg14/" in capsys.readouterr().err

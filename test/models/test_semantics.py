@@ -10,8 +10,8 @@ from torch.nn import functional as F
 
 from garps_core import Config
 from garps_core.errors import ConfigError, InputError, ModelError, WeightsError
-from garps_core.mixtures import reconstruct
-from garps_core.models.semantics import BAND_ROWS, Segmenter, labelled, prepared, scores_of, segment, segmenter_of
+from garps_core.mixtures.reconstruct import reconstruct
+from garps_core.models.semantics import BAND_ROWS, Segmenter, labelled, padded_input, scores_of, segment, segmenter_of
 from garps_core.types import View
 
 NAME = "dinov2_vits14_ade20k"
@@ -34,7 +34,7 @@ def networks(files: dict[str, Tensors]) -> dict[str, Segmenter]:
 
 def low(network: Segmenter, rgb: np.ndarray) -> torch.Tensor:
     with torch.inference_mode():
-        return network(prepared(rgb))
+        return network(padded_input(rgb))
 
 
 def margin(full: torch.Tensor) -> np.ndarray:
@@ -47,7 +47,7 @@ def test_the_published_heads_are_met(networks: dict[str, Segmenter], head: str) 
     network, rgb = networks[head], golden_rule.image(200, 300)
     full = scores_of(network, rgb, official=True).pixels(0, 200)
     ours = {
-        "input_padded": prepared(rgb),
+        "input_padded": padded_input(rgb),
         f"{head}.out.low": low(network, rgb),
         f"{head}.out.full": full[None],
         f"{head}.out.labels": segment(network, rgb, official=True)[None],
@@ -61,7 +61,7 @@ def test_odd_sizes_are_padded_and_cut_as_meant(networks: dict[str, Segmenter], h
     network, rgb = networks[head], golden_rule.image(201, 299)
     cropped = scores_of(network, rgb).pixels(0, 201)
     ours = {
-        "input_padded": prepared(rgb),
+        "input_padded": padded_input(rgb),
         f"{head}.out.low": low(network, rgb),
         f"{head}.official.full": scores_of(network, rgb, official=True).pixels(0, 201)[None],
         f"{head}.crop.full": cropped[None],
@@ -74,12 +74,12 @@ def test_odd_sizes_are_padded_and_cut_as_meant(networks: dict[str, Segmenter], h
 def test_the_taps_are_the_last_four_blocks(networks: dict[str, Segmenter]) -> None:
     network = networks["ms"]
     with torch.inference_mode():
-        maps = network.backbone(prepared(golden_rule.image(200, 300)), network.taps)
+        maps = network.backbone(padded_input(golden_rule.image(200, 300)), network.taps)
     golden_rule.compare(NAME, {f"tap{block}": value for block, value in zip((8, 9, 10, 11), maps, strict=True)})
 
 
 def plainly_merged(network: Segmenter, rgb: np.ndarray, sizes: list[tuple[int, int]], flips: list[bool]) -> np.ndarray:
-    """The same, step by step as it is described, with whole pictures of all classes."""
+    """Compute the labels step by step, with whole pictures of all classes."""
     import cv2
 
     total = torch.zeros(150, *rgb.shape[:2])

@@ -55,7 +55,7 @@ def networks(held: dict[str, Tensors]) -> dict[str, TwoView]:
 
 
 def views(size: str) -> torch.Tensor:
-    """Both golden pictures of a size, (2, 3, h, w)."""
+    """The two golden pictures of a size, (2, 3, h, w)."""
     h, w = map(int, size.split("x"))
     pictures = image(h, w), image(h, w, 16, 8, "image2")
     return torch.from_numpy(np.concatenate([chw(picture, *HALF) for picture in pictures]))
@@ -142,7 +142,7 @@ def test_golden_values_of_every_part(networks: dict[str, TwoView], name: str) ->
 
 
 def write_torch(path: Path, name: str, tensors: Tensors) -> None:
-    """As the authors write it: a namespace beside the tensors, some of which have two names."""
+    """The authors' files hold a namespace beside the tensors, some of which have two names."""
     args = argparse.Namespace(model="a call that nobody may evaluate", lr=1e-4)
     torch.save({"args": args, "model": with_aliases(name, tensors), "epoch": 3}, path)
 
@@ -212,7 +212,7 @@ def test_views_of_different_sizes_meet(networks: dict[str, TwoView]) -> None:
 
 
 def test_every_view_is_turned_by_its_own_places(networks: dict[str, TwoView]) -> None:
-    """Of views of different sizes: queries by those of the view that looks, keys by those of the one looked at."""
+    """With views of different sizes, queries turn by their own view's grid and keys by the other's."""
     torch.manual_seed(0)
     look, x, other = CrossAttention(64, 1), torch.randn(1, 6, 64), torch.randn(1, 8, 64)
     turn, other_turn = rotation((2, 3), 64), rotation((4, 2), 64)
@@ -258,7 +258,7 @@ def test_published_numbers_of_parameters_and_sizes_told_from_shapes(
 
 
 def changed(tensors: Tensors, **new: torch.Tensor | None) -> Tensors:
-    """With other tensors, or without where None; in the names a double underscore stands for a point."""
+    """Replace tensors, or leave them out where None; in the names a double underscore stands for a point."""
     everything = tensors | {key.replace("__", "."): value for key, value in new.items()}
     return {key: value for key, value in everything.items() if value is not None}
 

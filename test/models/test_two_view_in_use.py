@@ -14,7 +14,7 @@ import cv2
 import pytest
 import torch
 from box_room import K_WORDS
-from network_weights import DEPTH, FLASH3D, install, install_reduced, passes, reduced_tensors, write_pair
+from network_weights import DEPTH, FLASH3D, install, install_reduced, passes, reduced_tensors, shared, write_pair
 from safetensors.torch import save_file
 from small_mask2former import ADAPTER, HEAD, random_state
 
@@ -104,7 +104,7 @@ NO_FIT = "trusted pixels fit one pose: expected at least 20%"
 @pytest.mark.parametrize("name", [MAST3R, PTH])
 def test_two_pictures_and_nothing_else(files: Files, name: str, capsys: Captured) -> None:
     """Depth of both views and a try at the pose from one look at the pair; both layouts say the same."""
-    network = two_view_in_use.two_view_model(Config.preset("mast3r").replace({"start.weights": name})).network
+    network = shared().two_view(Config.preset("mast3r").replace({"start.weights": name})).network
     with passes(network.patch_embed) as seen:
         out = aligned(capsys, files, "--preset", "mast3r", *K_WORDS, *with_weights(f"weights={name}"))
         assert seen == [(2, 3, 96, 128)]
@@ -229,7 +229,7 @@ def test_what_is_not_finite_is_a_status(files: Files, tmp_path: Path, capsys: Ca
         ),
         (["--preset", "mast3r", "--start", "auto", "K"], "expected a two-view network to start with, one of mast3r"),
         (["--preset", "monocular", "--reconstruction", "two_view", "K"], "and start.method is auto: expected a two-v"),
-        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would promise too much"),
+        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would be too small"),
         (
             ["--preset", "mast3r", "K", "weights=dust3r-dpt"],
             "dust3r-dpt are weights of dust3r: expected some of mast3r",
@@ -292,7 +292,7 @@ def test_a_picture_that_is_too_long_is_said(files: Files, tmp_path: Path, capsys
 
 
 class Hostile:
-    """What a pickle should not bring."""
+    """A class that no pickle may bring."""
 
 
 @pytest.mark.parametrize("words", [["--preset", "mast3r"], ["--preset", "mast3r", *K_WORDS]])
@@ -311,7 +311,7 @@ def test_a_file_with_another_class_is_not_opened(
 def test_the_licence_is_told_as_weights_are_loaded(
     files: Files, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Also for a file that somebody has renamed."""
+    """A renamed file is recognised, too."""
     for path in weights.iterdir():
         os.link(path, tmp_path / path.name)
     os.link(weights / "mast3r.safetensors", tmp_path / "renamed.safetensors")
@@ -319,7 +319,7 @@ def test_the_licence_is_told_as_weights_are_loaded(
     for name in (MAST3R, PTH, *DUST3R, str(tmp_path / "renamed.safetensors")):
         kind = BY_NAME[name].kind if name in BY_NAME else MAST3R
         with caplog.at_level(logging.WARNING, "garps_core"):
-            two_view_in_use.two_view_model(Config().replace({"start.method": kind, "start.weights": name}))
+            shared().two_view(Config().replace({"start.method": kind, "start.weights": name}))
         (told,) = [record for record in caplog.records if record.name == "garps_core"]
         assert told.levelno == logging.WARNING
         file = BY_NAME[name].local if name in BY_NAME else "renamed.safetensors"
@@ -344,7 +344,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
     def opened(*given: object) -> None:
         pytest.fail(f"asked for {given}")
 
-    monkeypatch.setattr(two_view_in_use, "tensors_of", opened)
+    monkeypatch.setattr(two_view_in_use, "load_weights", opened)
     for name in PRESETS:
         if name not in ("mast3r", "paper", "paper_full"):
             assert command.main(["align", files["a"], files["b"], *K_WORDS, *depths(files), "--preset", name]) in (0, 1)
@@ -354,7 +354,7 @@ def test_no_other_preset_opens_a_file_of_them(files: Files, monkeypatch: pytest.
 def test_a_converted_file_is_the_same_network(
     files: Files, weights: Path, tmp_path: Path, name: str, capsys: Captured
 ) -> None:
-    """Under a name of one's own, with its kind, licence and variant inside; `check` knows it too."""
+    """The file has another name, with its kind, licence and variant inside; `check` knows it."""
     source, target, kind = weights / BY_NAME[name].local, tmp_path / "mine.safetensors", BY_NAME[name].kind
     assert command.main(["weights", "convert", str(source), str(target)]) == 0
     printed = capsys.readouterr().out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MASt3R and DUSt3R see of a picture, and that both orders of a pair come out however they are computed."""
+"""Inputs of MASt3R and DUSt3R; both orders of a pair agree however they are computed."""
 
 from argparse import Namespace
 from collections.abc import Iterator
@@ -15,13 +15,13 @@ from safetensors.torch import save_file
 
 from garps_core.errors import ConfigError, InputError, ModelError
 from garps_core.models.check import check_file
-from garps_core.models.mast3r import KEPT, NaverModel, prepared, prepared_square
+from garps_core.models.mast3r import KEPT, NaverModel, cropped_input, square_input
 from garps_core.models.two_view import Architecture, Stack, TwoView, built_from
 from garps_core.point_maps import PairMaps, PointMap, TwoViewModel
 
 MAST3R, DPT, LINEAR = TWO_VIEW
 SIDE = 128
-"""Of the resized pictures here; published networks see 512."""
+"""Longer side of the resized pictures here; published networks see 512."""
 PICTURES = {"a": image(60, 80), "b": image(60, 80, 16, 8, "image2"), "tall": image(80, 50), "large": image(150, 200, 9)}
 
 
@@ -38,7 +38,7 @@ TINY = Architecture(Stack(64, 1, 1), Stack(64, 1, 1), descriptors=5)
 
 @pytest.fixture
 def tiny() -> TwoView:
-    """Of random parameters, for what does not depend on them."""
+    """A network of random parameters, where the test does not depend on them."""
     torch.manual_seed(0)
     return TwoView(TINY).eval().requires_grad_(False)
 
@@ -72,7 +72,7 @@ def test_pictures_are_resized_and_cut_as_published(size, expected) -> None:
     rgb = image(*size)
     method = pillow.Resampling.LANCZOS if max(size) > 512 else pillow.Resampling.BICUBIC
     cut = pillow.fromarray(rgb).resize(resized[::-1], method).crop((left, top, left + columns, top + rows))
-    seen, framing = prepared(rgb)
+    seen, framing = cropped_input(rgb)
     assert framing.size == seen.shape[1:] == (rows, columns)
     assert framing.offset == (left, top)
     assert framing.scale == (resized[1] / size[1], resized[0] / size[0])
@@ -95,7 +95,7 @@ def test_the_variant_of_squares_sees_the_middle(size, expected) -> None:
     rgb = image(*size)
     method = pillow.Resampling.LANCZOS if max(size) > max(resized) else pillow.Resampling.BICUBIC
     cut = pillow.fromarray(rgb).resize(resized[::-1], method).crop((left, top, left + 224, top + 224))
-    seen, framing = prepared_square(rgb, 224)
+    seen, framing = square_input(rgb, 224)
     assert (framing.size, framing.offset) == ((224, 224), (left, top))
     assert framing.scale == (resized[1] / size[1], resized[0] / size[0])
     np.testing.assert_array_equal(seen, chw(np.asarray(cut), (0.5,) * 3, (0.5,) * 3)[0])
@@ -105,7 +105,7 @@ def test_the_framing_says_where_a_pixel_went() -> None:
     """A bright spot of a picture is found where the framing says, for both axes and a cut."""
     rgb = np.zeros((500, 750, 3), np.uint8)
     rgb[100:104, 600:604] = 255
-    seen, framing = prepared(rgb)
+    seen, framing = cropped_input(rgb)
     y, x = np.mgrid[: seen.shape[1], : seen.shape[2]]
     weight = (seen[0].numpy() + 1).clip(0)
     centre = np.array([[(weight * x).sum(), (weight * y).sum()]]) / weight.sum()
@@ -139,7 +139,7 @@ def maps_of(found: PairMaps) -> list[PointMap]:
 
 
 def largest_difference(one: PairMaps, other: PairMaps) -> float:
-    """Of all values, relative to the largest of their kind."""
+    """Largest difference of all values, relative to the largest of their kind."""
     assert one.framings == other.framings
     worst = 0.0
     for a, b in zip(maps_of(one), maps_of(other), strict=True):
@@ -151,7 +151,7 @@ def largest_difference(one: PairMaps, other: PairMaps) -> float:
 
 def one_by_one(network: TwoView, source, target) -> PairMaps:
     """The plain way: each order alone, each picture encoded anew."""
-    seen, framings = zip(*(prepared(picture, SIDE) for picture in (source, target)), strict=True)
+    seen, framings = zip(*(cropped_input(picture, SIDE) for picture in (source, target)), strict=True)
     grids = [(framing.size[0] // 16, framing.size[1] // 16) for framing in framings]
     orders = []
     for i, j in ((0, 1), (1, 0)):
@@ -188,7 +188,7 @@ def test_both_orders_are_those_of_single_passes(
 
 
 def test_the_orders_differ(networks: dict[str, TwoView]) -> None:
-    """So that no test here holds because everything is the same."""
+    """The outputs differ, so that no test here holds because everything is equal."""
     found = model(networks[MAST3R])(PICTURES["a"], PICTURES["b"])
     assert np.abs(found.source_first[0].points - found.target_first[1].points).max() > 1e-2
     assert np.abs(found.source_first[0].points - found.source_first[1].points).max() > 1e-2
@@ -304,7 +304,7 @@ def test_values_that_are_no_numbers_are_an_error(tiny: TwoView, part: str) -> No
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.bfloat16, 0.1), (torch.float16, 0.02)])
 def test_what_half_precision_costs(networks: dict[str, TwoView], dtype: torch.dtype, bound: float) -> None:
-    """With pseudo-random weights: an upper bound of order. The heads get, and give, float32."""
+    """An upper bound of order, with pseudo-random weights. The heads get, and give, float32."""
     pair = PICTURES["a"], PICTURES["b"]
     full, half = model(networks[MAST3R])(*pair), model(networks[MAST3R], dtype=dtype)(*pair)
     for one, other in zip(maps_of(full), maps_of(half), strict=True):

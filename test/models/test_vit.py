@@ -76,7 +76,7 @@ def test_sides_that_are_no_multiples_of_a_patch_are_refused(vit, shape):
 
 
 def test_gated_network_has_the_published_shapes():
-    """Of the giant: hidden 4096, so w12 has 8192 rows."""
+    """The giant has 4096 hidden channels, so w12 has 8192 rows."""
     with torch.device("meta"):
         giant = VisionTransformer(SIZES["vitg"])
     held = giant.state_dict()

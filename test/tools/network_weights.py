@@ -16,7 +16,8 @@ from box_room import TRUTH, K, room
 from safetensors.torch import save_file
 from torch import nn
 
-from garps_core import View
+from garps_core import View, align
+from garps_core.models.in_use import Networks
 from garps_core.models.two_view import Architecture, Stack, TwoView
 from garps_core.weights.manifest import BY_NAME
 
@@ -31,7 +32,7 @@ GOLDEN = {
 
 
 def tensors(name: str) -> dict[str, torch.Tensor]:
-    """Of the official file of that name in `garps weights list`."""
+    """Tensors of the official file of that name in `garps weights list`."""
     return {key: torch.from_numpy(value) for key, value in golden_rule.state(*GOLDEN[name]).items()}
 
 
@@ -50,13 +51,18 @@ def pair(depth: bool = False) -> tuple[View, View]:
 
 
 def write_pair(folder: Path) -> dict[str, str]:
-    """The same as files: a, b, and their depth a_mm, b_mm."""
+    """Write the views of `pair` as files: a, b, and their depth a_mm, b_mm."""
     paths = {}
     for name, view in zip("ab", pair(depth=True), strict=True):
         paths[name], paths[f"{name}_mm"] = str(folder / f"{name}.png"), str(folder / f"{name}_mm.png")
         cv2.imwrite(paths[name], view.rgb[:, :, ::-1])
         cv2.imwrite(paths[f"{name}_mm"], np.rint(view.depth * 1000).astype(np.uint16))
     return paths
+
+
+def shared() -> Networks:
+    """The networks that `estimate_relative_pose` uses."""
+    return align.NETWORKS
 
 
 @contextmanager
@@ -75,7 +81,7 @@ TWO_VIEW = {"mast3r_small": "mast3r", "dust3r_dpt_small": "dust3r", "dust3r_line
 
 
 def two_view_architecture(name: str) -> Architecture:
-    """Of a golden two-view network; the reduced ones have attention heads that are not 64 wide."""
+    """Architecture of a golden two-view network; the reduced ones have attention heads that are not 64 wide."""
     told = golden_rule.keys(name)["arch"]
     sizes = (tuple(told[f"{part}_{what}"] for what in ("embed_dim", "depth", "num_heads")) for part in ("enc", "dec"))
     encoder, decoder = (Stack(*size) for size in sizes)
@@ -83,12 +89,12 @@ def two_view_architecture(name: str) -> Architecture:
 
 
 def two_view_tensors(name: str) -> dict[str, torch.Tensor]:
-    """As a safetensors file holds them, without second names."""
+    """Tensors as in a safetensors file, without second names."""
     return {key: torch.from_numpy(value) for key, value in golden_rule.state(name).items()}
 
 
 def with_aliases(name: str, held: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """As a torch file holds them, some under two names."""
+    """Tensors as in a torch file, some under two names."""
     return held | {alias: held[own] for alias, own in golden_rule.keys(name)["aliases"].items()}
 
 
@@ -108,7 +114,7 @@ AHEAD, SURE = 1.0, 3.0
 
 
 def reduced_tensors(name: str, sureness: float = SURE) -> dict[str, torch.Tensor]:
-    """Of a reduced network with random parameters, as its safetensors file holds them; its points lie ahead."""
+    """Tensors of a reduced network with random parameters, as in its safetensors file; its points lie ahead."""
     torch.manual_seed(len(name))
     state = TwoView(REDUCED[name]).state_dict()
     for head in ("downstream_head1", "downstream_head2"):

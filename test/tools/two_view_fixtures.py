@@ -39,7 +39,7 @@ def installed_here(folder: Path) -> Path:
 
 
 def write_maps(path: Path, *known: tuple[Picture, Picture, PairMaps]) -> Path:
-    """What `recorded` is to say of pairs of pictures, source and target."""
+    """Write the answers of `recorded` about pairs of pictures, source and target."""
     held: dict[str, Any] = {}
     for source, target, maps in known:
         key = (digest(source) + digest(target)).hex()
@@ -72,7 +72,7 @@ class Recorded:
 
 
 def recorded(weights: str, device: str) -> Recorded:
-    """As an adapter's `load`."""
+    """Load the adapter `recorded`."""
     return Recorded(weights)
 
 
@@ -121,7 +121,7 @@ globals().update({name: _failing(name) for name in FAULTS})
 
 
 def without_weights(weights: str, device: str) -> None:
-    """Says so as GARPS does."""
+    """Raise an error of GARPS."""
     raise WeightsError(f"no weights in {weights}: expected my.pth")
 
 

@@ -50,7 +50,7 @@ def safetensors_of(path: Path, header: dict[str, object], data: bytes = b"") -> 
 
 
 def rezipped(path: Path, method: int, more: dict[str, bytes]) -> None:
-    """The same torch file, written anew by `zipfile` with entries added."""
+    """Write a torch file anew by `zipfile` with entries added."""
     with zipfile.ZipFile(path) as old:
         entries = {name: old.read(name) for name in old.namelist()}
     with zipfile.ZipFile(path, "w", method) as new:

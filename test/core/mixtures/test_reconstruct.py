@@ -3,7 +3,7 @@
 
 import subprocess
 import sys
-import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import torch
 from box_room import K
-from network_weights import DEPTH, install, pair, passes, tensors
+from network_weights import DEPTH, install, pair, passes, shared, tensors
 
 from garps_core import Config, Status, View, estimate_relative_pose
 from garps_core.cli import command
+from garps_core.devices import on_device
 from garps_core.errors import ConfigError, InputError, ModelError, ReconstructionError, WeightsError
-from garps_core.mixtures import reconstruct
-from garps_core.mixtures.reconstruct import with_depth
-from garps_core.models import depth_anything, in_use
-from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of
+from garps_core.mixtures import reconstruct as reconstruction
+from garps_core.models import depth_anything
+from garps_core.models.depth_anything import HEADS, TRAINING_FX, depth_of_images
 from garps_core.weights.manifest import BY_NAME
 
 MONOCULAR = Config.preset("monocular")
@@ -45,7 +45,11 @@ def asked(preset: Config = MONOCULAR, **changes: object) -> Config:
 
 
 def network() -> depth_anything.DepthAnythingV2:
-    return in_use.depth_network("", "any")
+    return shared().depth_network(MONOCULAR)
+
+
+def with_depth(views: Sequence[View], config: Config) -> list[View]:
+    return reconstruction.with_depth(views, config, shared())
 
 
 @pytest.mark.parametrize("preset", ["sensor", "monocular"])
@@ -55,10 +59,13 @@ def test_with_a_sensor_no_network_is_imported(preset: str, tmp_path: Path) -> No
         "rgb = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)\n"
         "view = View(rgb, np.array([[80, 0, 40], [0, 80, 30], [0, 0, 1.0]]), np.full((60, 80), 2, np.float32))\n"
         f"print(estimate(view, view, Config.preset({preset!r})).T_target_source is not None)\n"
-        "print([name for name in sys.modules if name.startswith('garps_core.models') or name == 'safetensors'])"
+        "print(sorted(name for name in sys.modules if name.startswith('garps_core.models.') or name == 'safetensors'))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert done.stdout.split("\n")[:2] == ["True", "[]"], done.stderr
+    assert done.stdout.split("\n")[:2] == [
+        "True",
+        "['garps_core.models.depth_networks', 'garps_core.models.in_use']",
+    ], done.stderr
 
 
 def test_both_views_share_one_pass_of_the_installed_network() -> None:
@@ -66,7 +73,7 @@ def test_both_views_share_one_pass_of_the_installed_network() -> None:
     with passes(network()) as seen:
         found = with_depth(views, MONOCULAR)
     assert seen == [(2, 3, 70, 98)]
-    expected = depth_of(network(), [view.rgb for view in views])
+    expected = depth_of_images(network(), [view.rgb for view in views])
     for view, given, depth in zip(found, views, expected, strict=True):
         np.testing.assert_array_equal(view.depth, depth)
         assert given.depth is None and view.rgb is given.rgb
@@ -85,7 +92,7 @@ def test_only_the_network_that_is_named_replaces_a_sensor(method: str) -> None:
     views = pair(depth=True)
     found = with_depth(views, asked(method=method))
     if method == "depth_anything_v2":
-        (expected,) = depth_of(network(), [views[0].rgb])
+        (expected,) = depth_of_images(network(), [views[0].rgb])
         np.testing.assert_allclose(found[0].depth, expected, atol=2e-3)
         assert np.abs(found[0].depth - views[0].depth).mean() > 1
     else:
@@ -123,29 +130,6 @@ def test_another_folder_is_another_network(tmp_path: Path, monkeypatch: pytest.M
         network()
 
 
-def test_threads_that_want_a_network_at_once_load_it_once() -> None:
-    loads: list[str] = []
-    gate = threading.Barrier(4)
-
-    @in_use.once
-    def load(name: str) -> str:
-        loads.append(name)
-        threading.Event().wait(0.05)
-        return name
-
-    def want() -> None:
-        gate.wait()
-        load("a")
-
-    threads = [threading.Thread(target=want) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert loads == ["a"]
-    assert (load("b"), load("a"), loads) == ("b", "a", ["a", "b", "a"])
-
-
 def test_weights_for_another_scene_are_refused(weights: Path) -> None:
     with pytest.raises(WeightsError, match="`garps weights fetch depth-anything-v2-outdoor-small`"):
         with_depth(pair(), asked(scene="outdoor"))
@@ -168,7 +152,7 @@ def test_the_size_of_a_network_is_that_of_its_tensors(tmp_path: Path, weights: P
     """Whatever its name says: here Small under the name of Base."""
     path = tmp_path / BY_NAME["depth-anything-v2-indoor-base"].local
     path.symlink_to(weights / BY_NAME[DEPTH].local)
-    assert in_use.depth_network(str(path), "any").head == HEADS["vits"]
+    assert shared().depth_network(asked(depth_weights=str(path))).head == HEADS["vits"]
 
 
 def test_a_relative_model_is_refused_by_its_name(tmp_path: Path, weights: Path) -> None:
@@ -245,7 +229,7 @@ def test_weights_that_do_not_fit_a_device_are_no_crash() -> None:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
     with pytest.raises(ModelError, match="out of memory on cpu for the weights of Full"):
-        in_use.on_device(Full(), "cpu")
+        on_device(Full(), "cpu")
 
 
 def test_values_that_are_no_numbers_are_no_mixture_and_damaged_weights_an_error(tmp_path: Path) -> None:
@@ -264,7 +248,7 @@ def test_the_smallest_view_has_depth_and_a_strip_is_refused() -> None:
     (found,) = with_depth([small], MONOCULAR)
     assert found.depth is not None and found.depth.shape == (16, 16) and np.isfinite(found.depth).all()
     with pytest.raises(ReconstructionError, match=r"usable depth pixels of 256"):
-        reconstruct(small, MONOCULAR.replace({"lifting.stride": 4}))
+        reconstruction.reconstruct(small, MONOCULAR.replace({"lifting.stride": 4}))
     for size in ((16, 2000), (2000, 16)):
         strip = View(np.zeros((*size, 3), np.uint8), K)
         with pytest.raises(InputError, match=rf"{size[1]}x{size[0]} pixels.*crop the image"):

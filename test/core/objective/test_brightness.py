@@ -12,8 +12,8 @@ from garps_core import Config
 from garps_core.depth_errors import error_sigmas
 from garps_core.geometry import adjoint, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
-from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import brightness_of
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective import brightness
 from garps_core.objective.brightness import fit_brightness
 
@@ -244,7 +244,7 @@ def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     T = se3_exp(0.5 * twist) @ TRUTH
 
     def pixels(pose):
-        return brightness._seen_at(x.points @ pose[:3, :3].T + pose[:3, 3], y)
+        return brightness._pixels_of(x.points @ pose[:3, :3].T + pose[:3, 3], y)
 
     reach = [T, *(se3_exp(sign * 4e-3 * e) @ T for e in np.eye(6) for sign in (1, -1))]
     kept = np.isfinite([pixels(pose)[:, 0] for pose in reach]).all(axis=0)

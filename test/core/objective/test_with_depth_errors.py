@@ -13,10 +13,10 @@ from problems import INLINE, problem_of
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
 from garps_core import Config, Prior, Status, align_mixtures
-from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
+from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information
@@ -37,7 +37,7 @@ SEEDS = st.integers(0, 10**6)
 
 def pairs_of(rows_seed=1, partners_seed=2, T=POSE):
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (rows_seed, partners_seed))
-    return pair_up(rows, partners, T, Rung(2.0, 1000, 9, 1), SETTINGS)
+    return pair_up(rows, partners, T, Rung(covariance_scale=2.0, components=1000, neighbours=9, steps=1), SETTINGS)
 
 
 FORWARD, BACKWARD = pairs_of(), pairs_of(2, 1, se3_inverse(POSE))
@@ -151,7 +151,11 @@ def test_corrected_points_stay_on_their_rays():
 def test_correcting_the_clouds_is_evaluating_with_the_errors():
     """Of the rows to the last digit: what the solver does between its rungs changes nothing."""
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
-    errors, rung, far = drawn(6, 0.03)[:MODES], Rung(2.0, 1000, 60, 1), replace(SETTINGS, max_distance_m=100.0)
+    errors, rung, far = (
+        drawn(6, 0.03)[:MODES],
+        Rung(covariance_scale=2.0, components=1000, neighbours=60, steps=1),
+        replace(SETTINGS, max_distance_m=100.0),
+    )
     of_corrected = pair_up(corrected(rows, errors), partners, POSE, rung, far)
     plain = pair_up(rows, partners, POSE, rung, far)
     got = evaluate_jointly(of_corrected, POSE, NONE, NONE)
@@ -171,7 +175,7 @@ def wrong_in_scale(gains=(1.03, 0.99), shapes=(0.0, 0.0)):
 
 
 def solved(mixtures, config, prior):
-    (solution,) = ladder.anneal(problem_of(mixtures, _known(prior, config), config))
+    (solution,) = ladder.anneal(problem_of(mixtures, weighted_start(prior, config), config))
     return solution
 
 
@@ -218,7 +222,7 @@ def test_exact_maps_keep_their_shape():
 
 
 def test_depth_errors_are_not_solved_for_unless_asked():
-    assert len(_known(disturbed(), Config()).error_precision) == 0
-    assert len(_known(disturbed(), MONOCULAR).error_precision) == 2 * MODES
+    assert len(weighted_start(disturbed(), Config()).error_precision) == 0
+    assert len(weighted_start(disturbed(), MONOCULAR).error_precision) == 2 * MODES
     paper = Config.preset("paper").replace({"alignment.depth_errors": True})
-    assert len(_known(disturbed(), paper).error_precision) == 0, "the paper has no such unknowns"
+    assert len(weighted_start(disturbed(), paper).error_precision) == 0, "the paper has no such unknowns"

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from surfaces import off, room
 
-from garps_core import Config, align
+from garps_core import Config
+from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.solver import search
 from garps_core.solver.brightness_search import CONTINUED, search_by_brightness
 from garps_core.start.initialise import identity
 
-START = align._known(identity(Config(), ""), Config())
+START = weighted_start(identity(Config(), ""), Config())
 AROUND = search.starting_poses(START, search.FINE_RINGS)
 
 

@@ -194,7 +194,12 @@ def test_a_prior_twenty_sigmas_off_is_called_inconsistent(views):
 
 
 def test_too_few_steps_are_reported(views):
-    hasty = Config().replace({"alignment.ladder": (Rung(10.0, 2000, 12, 1),), "alignment.max_uncertainty": 1e6})
+    hasty = Config().replace(
+        {
+            "alignment.ladder": (Rung(covariance_scale=10.0, components=2000, neighbours=12, steps=1),),
+            "alignment.max_uncertainty": 1e6,
+        }
+    )
     estimate = align_mixtures(*views, disturbed(), hasty)
     assert estimate.status is Status.MAX_ITERATIONS and "still moving after 1 step" in estimate.reason
     assert estimate.T_target_source is not None and not estimate.ok

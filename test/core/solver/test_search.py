@@ -9,8 +9,9 @@ from problems import problem_of
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align, align_mixtures, estimate_relative_pose
+from garps_core import Config, Status, align_mixtures, estimate_relative_pose
 from garps_core.geometry import se3_inverse, se3_log
+from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, methods, search
@@ -74,7 +75,7 @@ def test_views_of_different_rooms_have_no_converged_pose(rooms):
 
 def test_solutions_have_final_pairs_and_are_computed_only_when_asked_for(monkeypatch):
     source, target, truth = room(1, 4)
-    start, asked = align._known(identity(Config(), ""), Config()), []
+    start, asked = weighted_start(identity(Config(), ""), Config()), []
     problem = problem_of([reconstruct(view) for view in (source, target)], start)
     by_shape = search._by_shape
     monkeypatch.setattr(search, "_by_shape", lambda *given: asked.append(1) or by_shape(*given))

@@ -17,7 +17,7 @@ PoseWithCovarianceStamped = pytest.importorskip("geometry_msgs.msg").PoseWithCov
 
 
 class Trial:
-    """A node that has answered a first pair, its cameras, and what it says."""
+    """A node that has answered a first pair, its cameras, and its diagnostics."""
 
     def __init__(self, node: NodeProcess, peer: Peer, **how: str) -> None:
         self.node, self.peer = node, peer
@@ -39,7 +39,7 @@ class Trial:
         self.poses.clear()
 
     def complaints(self) -> dict[str, tuple[int, str]]:
-        """How many messages were refused and pairs rejected, and why last."""
+        """Number of messages refused and of pairs rejected, each with its last reason."""
         inputs, estimates = self.values("inputs"), self.values("estimates")
         rejected = sum(int(count) for name, count in estimates.items() if name.startswith("rejected: "))
         return {
@@ -214,10 +214,10 @@ REJECTED = {
     ),
     "depth as colour": (depth(np.zeros((*SIZE[::-1], 3), np.uint8), "rgb8"), "encoding is 'rgb8': expected a depth"),
     "depth in millimetres as 32FC1": (in_millimetres, "this looks like millimetres; expected metres"),
-    "depth all NaN": (depth(metres(np.nan)), "no_reconstruction: "),
-    "depth all zero": (depth(np.zeros(SIZE[::-1], np.uint16), "16UC1"), "no_reconstruction: "),
-    "depth all infinite": (depth(metres(np.inf)), "no_reconstruction: "),
-    "depth of the other byte order": (of_depth(is_bigendian=1), "no_reconstruction: the view has"),
+    "depth all NaN": (depth(metres(np.nan)), "no_mixture: "),
+    "depth all zero": (depth(np.zeros(SIZE[::-1], np.uint16), "16UC1"), "no_mixture: "),
+    "depth all infinite": (depth(metres(np.inf)), "no_mixture: "),
+    "depth of the other byte order": (of_depth(is_bigendian=1), "no_mixture: the view has"),
     "depth negative": (depth(metres(-2.0)), "invalid_input: "),
     "camera_info of another size": (of_info(width=640, height=480), "camera_info describes 640x480"),
     "camera_info of another shape": (of_info(width=640), "this is another camera or a cropped image"),
@@ -232,7 +232,7 @@ REJECTED = {
         of_info(distortion_model="banana", d=coefficients(0.1)),
         "malformed_message: distortion_model is 'banana'",
     ),
-    "coefficients beyond any lens": (of_info(d=coefficients(-1e6, 1e9, 0, 0, 0)), "no_reconstruction: the view has"),
+    "coefficients beyond any lens": (of_info(d=coefficients(-1e6, 1e9, 0, 0, 0)), "no_mixture: the view has"),
     "binning of a thousand": (of_info(binning_x=1000), "malformed_message: binning_x is 1000"),
     "window outside": (
         lambda shot: change(shot.camera_info.roi, {"x_offset": 300, "width": 100, "height": 100}),
