@@ -9,12 +9,12 @@ from problems import problem_of
 from scipy.spatial.transform import Rotation
 from surfaces import FREE, TRUTH, disturbed, off, random_pose, room, two_mixtures
 
-from garps_core import Config, Status, align_mixtures, estimate_relative_pose, mixture_alignment
+from garps_core import Config, Status, align_mixtures, estimate_relative_pose
 from garps_core.geometry import se3_inverse, se3_log
 from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.state import WeightedStart
-from garps_core.solver import ladder, search
+from garps_core.solver import ladder, methods, search
 from garps_core.start.initialise import identity
 
 FROM_IDENTITY = Config().replace({"start.method": "identity"})
@@ -96,14 +96,14 @@ def test_solutions_have_final_pairs_and_are_computed_only_when_asked_for(monkeyp
 def test_a_convincing_solution_ends_the_search(monkeypatch):
     source, target, _ = room(1, 4)
     mixtures = [reconstruct(view) for view in (source, target)]
-    start, followed, searched = identity(Config(), ""), {}, mixture_alignment.search
+    start, followed, searched = identity(Config(), ""), {}, methods.search
 
     def counted(*given):
         for solution in searched(*given):
             followed[enough] = followed.get(enough, 0) + 1
             yield solution
 
-    monkeypatch.setattr(mixture_alignment, "search", counted)
+    monkeypatch.setattr(methods, "search", counted)
     for enough in (-1.0, 1.0):
         config = Config().replace({"alignment.enough_correlation": enough, "alignment.brightness_measurements": 0.05})
         estimate = align_mixtures(*mixtures, start, config)
@@ -120,8 +120,8 @@ def test_poses_that_lie_together_are_one():
 def test_a_precise_start_is_not_searched_from(monkeypatch):
     """The uncertainty of scene points, as a share of their range, decides."""
     mixtures, calls = two_mixtures(), []
-    searched = mixture_alignment.search
-    monkeypatch.setattr(mixture_alignment, "search", lambda *given: calls.append(given) or searched(*given))
+    searched = methods.search
+    monkeypatch.setattr(methods, "search", lambda *given: calls.append(given) or searched(*given))
     assert align_mixtures(*mixtures, disturbed()).ok and not calls
     assert align_mixtures(*mixtures, disturbed(covariance=16 * FREE)).ok and len(calls) == 1
 
