@@ -90,7 +90,7 @@ def align(
     target: Annotated[Path, typer.Argument(help="Image of the target camera, or splats (.ply).", metavar="TGT")],
     K: Annotated[Four | None, typer.Option("--K", help="Intrinsics of images, px.", metavar="FX FY CX CY")] = None,
     K_target: Annotated[
-        Four | None, typer.Option("--K-target", help="Of the target, if different.", metavar="FX FY CX CY")
+        Four | None, typer.Option("--K-target", help="Intrinsics of the target, if different, px.", metavar="FX FY CX CY")
     ] = None,
     depth_source: Annotated[
         Path | None, typer.Option(help="Depth registered to SRC: 16-bit PNG (mm), .npy or float TIFF (m).")
@@ -100,7 +100,7 @@ def align(
         float | None, typer.Option(help="Metres per unit of the depth files. [integers 0.001, floats 1]")
     ] = None,
     prior: Annotated[
-        str | None, typer.Option(help="Start pose T_target_source.", metavar='"X Y Z QX QY QZ QW"')
+        str | None, typer.Option(help="Start pose T_target_source, metres and quaternion.", metavar='"X Y Z QX QY QZ QW"')
     ] = None,
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
@@ -109,7 +109,7 @@ def align(
         str | None, typer.Option(help=f"{', '.join(PRESETS)}. [default; without depth monocular]")
     ] = None,
     reconstruction: Annotated[str | None, typer.Option(help=f"{', '.join(methods())}. [auto]")] = None,
-    start: Annotated[str | None, typer.Option(help=f"Initial pose: {', '.join(STARTS)}. [auto]")] = None,
+    start: Annotated[str | None, typer.Option(help=f"Start pose: {', '.join(STARTS)}. [auto]")] = None,
     set_: Changes = None,
     settings: Settings = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,
@@ -157,8 +157,8 @@ def doctor() -> int:
     from garps_core.cli.doctor import examine
 
     rows, healthy = examine()
-    for name, finding in rows:
-        print(f"{name:<15} {finding}")
+    for name, result in rows:
+        print(f"{name:<15} {result}")
     return 0 if healthy else 1
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from garps_core.config import Alignment, Config, Lifting, Reconstruction, Rung, Start
+from garps_core.config import Config, Rung
 from garps_core.config.field import Checked, description, setting
 from garps_core.errors import ConfigError
 from garps_ros.parameters.settings import NodeSettings
@@ -34,7 +34,7 @@ RETIRED = re.compile(
     r"|climbs?|fit_brightness|worth|initial|says|told|so many)\b",
     re.IGNORECASE,
 )
-CLASSES = (Config, Reconstruction, Lifting, Start, Alignment, Rung, NodeSettings)
+CLASSES = (Config, *(type(f.default) for f in fields(Config) if isinstance(f.default, Checked)), Rung, NodeSettings)
 SETTINGS = {f"{kind.__name__}.{f.name}": f for kind in CLASSES for f in fields(kind) if "doc" in f.metadata}
 FULL_NAMES = {*Config().settings(), *(f.name for f in fields(NodeSettings))}
 
