@@ -25,9 +25,11 @@ import typer
 from rich.console import Console
 
 from bench.pairs import learned_rooms
-from bench.pairs.datasets import DATA, Pair, available, disturbed_prior, load_pairs, spread
-from bench.pairs.sources import DEMO_NET, config_of, with_depth_of
-from bench.scoring.depth_errors import depth_errors
+from bench.pairs.depths import DEMO_NET, config_of, with_depth_of
+from bench.pairs.pair import Pair, spread
+from bench.pairs.readers.pairs_json import DATA, available, load_pairs
+from bench.pairs.starts import disturbed_prior
+from bench.rows.depth_errors import depth_errors
 from garps_core import Config, estimate_relative_pose, metrics
 from garps_core.models.demo_net import DemoNet, depth_of_views, shipped
 from garps_core.types import View
@@ -135,7 +137,7 @@ def _seconds(what: Callable[[], Any]) -> float:
 
 def main(
     data: Annotated[Path, typer.Option(help="folder that holds dev/<set>/pairs.json")] = DATA,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set")] = None,
+    limit: Annotated[int | None, typer.Option(help="largest number of pairs of a set")] = None,
     rooms: Annotated[Path, typer.Option(help="folder of the generated pairs, for the time")] = learned_rooms.FOLDER,
     out: Annotated[Path, typer.Option(help="folder of table and pictures")] = Path("out/learned_photos"),
 ) -> None:

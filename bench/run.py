@@ -26,30 +26,20 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.pairs.datasets import HALVES, Pair, disturbed_prior
-from bench.pairs.sources import (
-    DEPTHS,
-    NAMES,
-    SENSOR,
-    config_of,
-    defaults_of,
-    named,
-    overlap_of,
-    pairs_of,
-    sources_there,
-    usable,
-    why_not,
-    with_depth_of,
-    without_depth,
-)
-from bench.peers.baselines import METHODS, NEED_NO_START
+from bench.machine.facts import machine_facts
+from bench.machine.jobs import computed
+from bench.pairs.depths import DEPTHS, SENSOR, config_of, overlap_of, usable, why_not, with_depth_of, without_depth
+from bench.pairs.pair import Pair
+from bench.pairs.readers.pairs_json import HALVES
+from bench.pairs.sources import NAMES, defaults_of, named, pairs_of, sources_there
+from bench.pairs.starts import disturbed_prior
+from bench.peers.methods import METHODS, NEED_NO_START
 from bench.report.write import write_report
-from bench.rows.evaluate import STARTS, evaluate_pair, failed_pair, run_garps
-from bench.rows.jobs import computed
+from bench.rows.depth_errors import errors_of_pair
+from bench.rows.pair_rows import STARTS, failed_rows, rows_of_pair, run_garps
+from bench.rows.row import Row
 from bench.rows.row_log import Key, RowLog, reusable_rows, reuse_note
 from bench.rows.variants import GARPS, GARPS_NO_FEATURES, GARPS_PAPER, VARIANTS
-from bench.scoring.depth_errors import errors_of_pair
-from bench.scoring.tables import Row, machine_facts
 from garps_core import Config, GarpsError
 from garps_core.config.text import changed_config, read_settings
 
@@ -75,18 +65,18 @@ class Job:
 
     @property
     def keys(self) -> list[Key]:
-        """Of its rows."""
+        """Keys of its rows."""
         return [(self.depth, self.pair.set, start, self.pair.id) for start in self.starts]
 
 
-def rows_of(job: Job) -> list[list[Row]]:
+def job_rows(job: Job) -> list[list[Row]]:
     """The rows of a job, start by start; methods that need no start run once. Without depth all are failures."""
     same: Row = {"depth": job.depth, "true_overlap": overlap_of(job.pair)}
     try:
         pair = with_depth_of(job.pair, job.depth, job.seed)
     except GarpsError as error:  # of this pair: networks that cannot run at all are left out beforehand
         reason = f"no depth: {error}"
-        rows = [failed_pair(job.config, job.pair, start, job.methods, reason) for start in job.starts]
+        rows = [failed_rows(job.config, job.pair, start, job.methods, reason) for start in job.starts]
         return [[same | row for row in of_start] for of_start in rows]
     if job.depth != SENSOR:
         same["depth_errors"] = errors_of_pair(pair, job.pair)
@@ -94,7 +84,7 @@ def rows_of(job: Job) -> list[list[Row]]:
     shared: dict[str, Row] = {}
     for start in job.starts:
         known = {name: row | {"start": start} for name, row in shared.items()} | dict(job.known.get(start, {}))
-        rows = evaluate_pair(job.config, pair, start, job.methods, job.seed, known)
+        rows = rows_of_pair(job.config, pair, start, job.methods, job.seed, known)
         made.append([same | row for row in rows])
         shared = {row["method"]: row for row in rows if row["method"] in NEED_NO_START}
     return made
@@ -115,7 +105,7 @@ def _known(what: str, names: list[str], known: Sequence[str]) -> list[str]:
 def config_for(depth: str, settings: Path | None, change: Sequence[str]) -> Config:
     """Settings of GARPS for a depth: its preset, then the file, then single changes."""
     config = config_of(depth)
-    return changed_config(config if settings is None else read_settings(settings, config), change)
+    return changed_config(config if settings is None else read_settings(settings, config, DEPTHS[depth]), change)
 
 
 def main(
@@ -130,7 +120,7 @@ def main(
         list[str] | None, typer.Option(help='setting of GARPS, as "alignment.effective_measurements=100"')
     ] = None,
     limit: Annotated[
-        int | None, typer.Option(help="at most so many pairs of a set: spread evenly, of learned rooms the first")
+        int | None, typer.Option(help="largest number of pairs of a set: spread evenly, of learned rooms the first")
     ] = None,
     half: Annotated[
         str, typer.Option(help=f"of each pairs.json: {', '.join(HALVES)}; dev takes generated rooms to tune on")
@@ -244,7 +234,7 @@ def _run(jobs: Sequence[Job], log: RowLog, workers: int, scheduler: str, console
         first = with_depth_of(jobs[0].pair, jobs[0].depth)
         run_garps(jobs[0].config, first, "disturbed", disturbed_prior(first))
     with Progress(console=console) as bars:
-        for made in bars.track(computed(rows_of, jobs, workers, scheduler), len(jobs), description="pairs"):
+        for made in bars.track(computed(job_rows, jobs, workers, scheduler), len(jobs), description="pairs"):
             log.add([row for rows in made for row in rows])
 
 

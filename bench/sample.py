@@ -21,11 +21,11 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
+from bench.pairs.depths import DEPTHS, MONOCULAR, SENSOR
 from bench.pairs.readers import realestate10k as re10k
-from bench.pairs.readers.files import image
+from bench.pairs.readers.dataset_files import image
 from bench.pairs.readers.pair_list import RAW
 from bench.pairs.readers.sfm_scale import SOURCE
-from bench.pairs.sources import DEPTHS, MONOCULAR, SENSOR
 from garps_core import Config, GarpsError, View
 from garps_core.align import NETWORKS as SHARED
 from garps_core.mixtures.reconstruct import with_depth

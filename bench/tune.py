@@ -6,7 +6,7 @@
     python -m bench.tune --depth monocular --data pairs=FOLDER --data bare=out/bare_rooms
 
 The best settings are written to --out as DEPTH.yaml: for `garps align --settings`, `garps-replay --settings`,
-`python -m bench.run --settings` and, as a file of parameters, for the node.
+`python -m bench.run --settings` and the node's parameter `settings_file`.
 
 Settings are chosen on the dev half of recorded pairs and on the generated rooms to tune on (`bench.run --half dev`):
 sensor depth on recorded pairs, monocular depth on these and bare rooms, the demonstration network's on its own rooms.
@@ -33,24 +33,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from bench.pairs.datasets import Pair
-from bench.pairs.sources import (
-    BARE,
-    DEMO_NET,
-    MONOCULAR,
-    PAIRS,
-    ROOMS,
-    SENSOR,
-    config_of,
-    defaults_of,
-    named,
-    pairs_of,
-    sources_there,
-    usable,
-    with_depth_of,
-)
-from bench.rows.evaluate import evaluate
-from bench.scoring.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row, is_right
+from bench.pairs.depths import DEMO_NET, MONOCULAR, SENSOR, config_of, usable, with_depth_of
+from bench.pairs.pair import Pair
+from bench.pairs.sources import BARE, PAIRS, ROOMS, defaults_of, named, pairs_of, sources_there
+from bench.rows.pair_rows import rows_of_pairs
+from bench.rows.row import GARPS, Row
+from bench.scoring.summary import MAP_FREE_DEG, MAP_FREE_M, is_right
 from garps_core import Config, GarpsError
 from garps_core.config.text import write_settings
 from garps_core.metrics import CHI2_6_95
@@ -83,14 +71,14 @@ SPACES: dict[str, dict[str, tuple[float, float]]] = {
         "lifting.patch_sigma": (0.05, 0.6),
     },
 }
-"""What is searched, all on a logarithmic scale: few settings, so that half of the pairs can decide about them."""
+"""Ranges that are searched, all on a logarithmic scale: few settings, so that half of the pairs can decide."""
 TUNED_ON = {SENSOR: (PAIRS,), MONOCULAR: (PAIRS, BARE), DEMO_NET: (ROOMS,)}
 """Kinds of sources that decide about a depth."""
 SMALLEST_M, LARGEST_M = 1e-3, 1.0
 
 
 def loss_of(tables: Sequence[Sequence[Row]]) -> float:
-    """What a trial is worth (module docstring), less is better. Rows are those of GARPS, a table at a time."""
+    """The loss of a trial (module docstring), less is better. Rows are those of GARPS, a table at a time."""
     inside = [row["nees"] < CHI2_6_95 for rows in tables for row in rows if "nees" in row]
     missed = max(0.0, abs(float(np.mean(inside)) - 0.95) - 0.025) if inside else 1.0
     return float(np.mean([_table_loss(rows) for rows in tables])) + missed / 0.05
@@ -115,7 +103,7 @@ class Part(NamedTuple):
 def run(config: Config, planned: Sequence[Part]) -> Iterator[list[Row]]:
     """GARPS' rows of one table after the other."""
     for part in planned:
-        rows = evaluate(config, _pairs(part.depth, part.source, part.half, part.limit), part.start, [GARPS])
+        rows = rows_of_pairs(config, _pairs(part.depth, part.source, part.half, part.limit), part.start, [GARPS])
         yield [row for row in rows if row["method"] == GARPS]
 
 
@@ -127,7 +115,7 @@ def _pairs(depth: str, source: str, half: str, limit: int | None) -> list[Pair]:
 
 
 def search(study: optuna.Study, planned: Sequence[Part], trials: int, console: Console) -> None:
-    """Run so many trials more; the first of a study is the preset as it is."""
+    """Run this many more trials; the first of a study is the preset as it is."""
     depth = planned[0].depth
     preset = config_of(depth)
     if not _completed(study):
@@ -191,9 +179,9 @@ def planned_parts(depth: str, sources: Sequence[str], limit: int | None) -> list
 
 def main(
     depth: Annotated[str, typer.Option(help=f"which preset: {', '.join(SPACES)}")] = SENSOR,
-    trials: Annotated[int, typer.Option(help="so many more; 0 = only report")] = 40,
+    trials: Annotated[int, typer.Option(help="number of further trials; 0 = only report")] = 40,
     data: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER, as of bench.run; repeat at will")] = None,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, as of bench.run")] = None,
+    limit: Annotated[int | None, typer.Option(help="largest number of pairs of a set, as of bench.run")] = None,
     out: Annotated[Path, typer.Option(help="folder of the study; one that is there goes on")] = Path("out/tune"),
 ) -> None:
     """Choose settings on one half of the pairs, report on the other."""
@@ -212,8 +200,8 @@ def main(
     for name, value in study.best_params.items():
         console.print(f"  {name} = {value:.4g}   (preset: {Config.preset(depth).settings()[name]:g})")
     chosen = out / f"{depth}.yaml"
-    remark = f"Best of {len(study.trials)} trials of python -m bench.tune --depth {depth}: loss {study.best_value:.4f}"
-    write_settings(chosen, depth, study.best_params, remark)
+    comment = f"Best of {len(study.trials)} trials of python -m bench.tune --depth {depth}: loss {study.best_value:.4f}"
+    write_settings(chosen, depth, study.best_params, comment)
     console.print(f"settings: {chosen}")
     console.print(report(study, planned, console))
 

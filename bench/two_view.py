@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a two-view network costs on this machine's CPU, stage by stage, for one pair of pictures.
+"""Cost of a two-view network on this machine's CPU, stage by stage, for one pair of pictures.
 
     python -m bench.two_view [--size full|small] [--head mast3r|dust3r|linear] [--runs 3] [--threads 2]
 
@@ -20,10 +20,10 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.networks.__main__ import counted_flop
-from bench.networks.pair import peak_mib, seconds_of
-from bench.scoring.tables import machine_facts
-from bench.speed.parts import Check, Row, Section, markdown
+from bench.machine.cost import peak_mib, seconds_of
+from bench.machine.facts import machine_facts
+from bench.machine.flop import counted_flop
+from bench.report.checks import Check, Row, Section, markdown
 from garps_core.models.mast3r import NaverModel, cropped_input
 from garps_core.models.two_view import Architecture, Stack, TwoView
 
@@ -77,7 +77,7 @@ def measured(name: str, call: Call, runs: int) -> Row:
 
 
 def counted(row: Row, call: Call) -> Row:
-    """The same line with its operations; counting them keeps intermediate results, so it comes after every peak."""
+    """A line with its operations; counting them keeps intermediate results, so it comes after every peak."""
     with torch.inference_mode():
         flop = counted_flop(call) / 1e9
     return row | {"GFLOP": flop, "GFLOP per CPU s": flop / row["CPU s"]}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metric relative camera pose from two views, by aligning two 3D Gaussian mixtures."""
 
-from garps_core.align import align_mixtures, estimate_relative_pose
+from garps_core.align import Estimator, align_mixtures, estimate_relative_pose
 from garps_core.config import Config
 from garps_core.errors import ConfigError, GarpsError, InputError, ReconstructionError
 from garps_core.mixtures.reconstruct import reconstruct
@@ -10,6 +10,7 @@ from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 __all__ = [
     "Config",
     "ConfigError",
+    "Estimator",
     "GarpsError",
     "InputError",
     "Mixture",

@@ -1,52 +1,142 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole story: two views -> two mixtures -> initial pose -> alignment -> pose with covariance, or why not."""
+"""The whole story: two views -> two mixtures -> start poses -> alignment -> pose with covariance, or why not."""
 
 from __future__ import annotations
 
-import threading
 import time
-from contextlib import ContextDecorator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 
-from garps_core.config import Alignment, Config
+from garps_core.config import Config
 from garps_core.config.combinations import check_settings
-from garps_core.depth_errors import DEPTH_MODES, error_sigmas
 from garps_core.devices import checked_device
-from garps_core.errors import (
-    InitialisationError,
-    InputError,
-    MissingDepthError,
-    ModelError,
-    ReconstructionError,
-    WeightsError,
-)
-from garps_core.geometry import Array, ros_from_twist, twist_from_ros
-from garps_core.mixtures.reconstruct import mixtures_of, with_depth
+from garps_core.errors import InitialisationError, MissingDepthError, ModelError, ReconstructionError, WeightsError
+from garps_core.mixture_alignment import align_mixtures, best_alignment
+from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, with_depth
 from garps_core.models.depth_networks import depth_from
 from garps_core.models.in_use import Networks
-from garps_core.objective.brightness import fit_brightness
-from garps_core.objective.pairs import DeviceMixture, overlap, to_device
-from garps_core.objective.state import WeightedStart
 from garps_core.point_maps import PairMaps
-from garps_core.solver import ladder, paper
-from garps_core.solver.ladder import MIN_ROWS, Solution
-from garps_core.solver.search import search
-from garps_core.start.initialise import identity, initialise
+from garps_core.start.initialise import initialise
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
-from garps_core.verdict.covariance import inflated, pose_covariance, share_of_known
-from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
 
-SEARCHED_SIGMAS = 3.0
-"""What a search found may be a neighbour of the right optimum: its sigmas count so many times as much."""
+__all__ = ["Estimator", "align_mixtures", "estimate_relative_pose"]
 
 CENTRING = 0.01
-"""Sigma of a principal point that is taken to lie in the image's middle, over the image's longer side."""
+"""Sigma of a principal point that is assumed in the middle of the image, as a share of the image's longer side."""
+
+Mixtures = tuple[Mixture, Mixture]
 
 NETWORKS = Networks()
-"""Networks that all estimates of this process share."""
+"""Networks that all calls of `estimate_relative_pose` share. An `Estimator` has its own."""
+
+
+class Estimator:
+    """Estimates relative poses with one configuration, and owns the networks that it has loaded.
+
+    Any number of threads may share one. It may be used in a child process after a fork. A pickled copy is its
+    configuration; the copy loads its networks anew.
+
+    Args:
+        config: settings; the default preset when None.
+        networks: networks to share with other estimators; None = its own, loaded when they are first needed.
+    """
+
+    def __init__(self, config: Config | None = None, networks: Networks | None = None) -> None:
+        self.config = config or Config()
+        self.networks = networks or Networks()
+
+    def estimate(self, source: View, target: View, prior: Prior | None = None) -> PoseEstimate:
+        """Estimate the pose of the source camera in the target camera's frame, in metres, with its covariance.
+
+        Args:
+            source, target: two views of one static scene, with depth unless `config.reconstruction` names a network.
+            prior: knowledge of the pose from elsewhere; it enters the estimate with its covariance.
+        Returns:
+            PoseEstimate. Where no pose could be had, its status and reason say why and T_target_source is None.
+        Raises:
+            MissingDepthError: a view has no depth, and the settings want a sensor's.
+            ConfigError: the device is not there, or settings do not go together.
+            WeightsError: the weights of a network are missing, or not the expected ones.
+        """
+        return self.estimate_with_mixtures(source, target, prior)[0]
+
+    def estimate_with_mixtures(
+        self, source: View, target: View, prior: Prior | None = None, maps: PairMaps | None = None
+    ) -> tuple[PoseEstimate, Mixtures | None]:
+        """Return what `estimate` does, and the two mixtures that were aligned; None where there are none.
+
+        `maps` is the answer of the two-view network about this pair where it has been asked before, e.g. for the
+        intrinsics; None = it is asked where the settings need it. Raises what `estimate` does.
+        """
+        views, origin = (source, target), depth_from((source, target), self.config)
+        estimate, mixtures = self._estimate(views, prior, maps)
+        fx_source, fx_target = (float(view.K[0, 0]) if view.K_estimated else None for view in views)
+        return replace(estimate, estimated_fx_px=(fx_source, fx_target), depth_from=origin), mixtures
+
+    def reconstruct(self, view: View) -> Mixture:
+        """Return the mixture of one view in its own camera frame. Raises as `garps_core.reconstruct`."""
+        return mixture_of(with_depth([view], self.config, self.networks)[0], self.config, self.networks)
+
+    def _estimate(
+        self, views: tuple[View, View], prior: Prior | None, maps: PairMaps | None
+    ) -> tuple[PoseEstimate, Mixtures | None]:
+        config, networks, stages = self.config, self.networks, _Stages()
+        checked_device(config.device)
+        try:
+            maps = maps or self._maps_for_depth(views)
+            with_depths = with_depth(views, config, networks, maps)
+            if with_depths != list(views):  # a network has been asked, which takes time
+                stages.end("depth")
+            config = with_wider_errors(config, *views)
+            source, target = mixtures_of(with_depths, config, networks)
+            stages.end("reconstruct")
+            starts = initialise(with_depths[0], with_depths[1], config, prior, networks, maps)
+            stages.end("initialise")
+        except InitialisationError as failure:
+            stages.end("initialise")
+            return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=stages.seconds), (source, target)
+        except (ModelError, ReconstructionError) as failure:
+            if isinstance(failure, (WeightsError, MissingDepthError)):
+                raise  # a mistake in the settings, not a property of these images
+            return PoseEstimate(Status.NO_MIXTURE, str(failure), seconds=stages.seconds), None
+        estimate = best_alignment(source, target, starts, config)
+        stages.end("align")
+        estimate.seconds.update(stages.seconds)
+        return estimate, (source, target)
+
+    def _maps_for_depth(self, views: tuple[View, View]) -> PairMaps | None:
+        if self.config.reconstruction.method != "two_view":
+            return None
+        check_settings(self.config)
+        return self.networks.pair_maps(views[0].rgb, views[1].rgb, self.config)
+
+
+@dataclass
+class _Stages:
+    """Wall time in s of each stage, from the end of the one before."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _begin: float = field(default_factory=time.perf_counter)
+
+    def end(self, name: str) -> None:
+        """Note that a stage has ended now."""
+        now = time.perf_counter()
+        self.seconds[name], self._begin = now - self._begin, now
+
+
+def with_wider_errors(config: Config, *views: View) -> Config:
+    """Settings with wider errors of shape and direction where a view's intrinsics are a network's estimate.
+
+    The shape of both depth maps is then solved for.
+    """
+    off_centre = [CENTRING * max(view.rgb.shape[:2]) / view.K[0, 0] for view in views if view.K_estimated]
+    if not off_centre:
+        return config
+    focal = config.start.focal_sigma
+    more = {"scale_sigma": focal, "warp_sigma": focal, "pointing_sigma_rad": max(off_centre)}
+    wider = {f"lifting.{name}": float(np.hypot(getattr(config.lifting, name), sigma)) for name, sigma in more.items()}
+    return config.replace(wider | {"alignment.depth_errors": True})
 
 
 def estimate_relative_pose(
@@ -54,227 +144,6 @@ def estimate_relative_pose(
 ) -> PoseEstimate:
     """Estimate the pose of the source camera in the target camera's frame, in metres, with its covariance.
 
-    Args:
-        source, target: two views of the same static scene; depth, where `config.reconstruction` wants a sensor's.
-        config: settings; the default preset when None.
-        prior: what is known of the pose beforehand, if anything; it enters the estimate with its covariance.
-    Returns:
-        PoseEstimate; when no pose could be had its status and reason say why and T_target_source is None.
-    Raises:
-        MissingDepthError: a view has no depth, and the settings want a sensor's.
-        ConfigError: the device is not there, or settings do not go together.
-        WeightsError: a network's weights are missing or not what they should be.
+    Arguments, answer and errors are those of `Estimator.estimate`; the default preset when `config` is None.
     """
-    return estimate_with_mixtures(source, target, config, prior)[0]
-
-
-def estimate_with_mixtures(
-    source: View,
-    target: View,
-    config: Config | None = None,
-    prior: Prior | None = None,
-    maps: PairMaps | None = None,
-) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
-    """`estimate_relative_pose`, and the two mixtures it aligned, to be drawn or stored; None where there are none.
-
-    maps: answer of the two-view network about this pair, where it has been asked before, e.g. for the intrinsics.
-    """
-    estimate, mixtures = _estimated(source, target, config or Config(), prior, maps)
-    focal = tuple(float(view.K[0, 0]) if view.K_estimated else None for view in (source, target))
-    origin = depth_from((source, target), config or Config())
-    return replace(estimate, estimated_fx_px=(focal[0], focal[1]), depth_from=origin), mixtures
-
-
-def _doubting(config: Config, *views: View) -> Config:
-    """With more doubt about both views' shape and direction where intrinsics are estimates; the shape is solved for."""
-    middles = [CENTRING * max(view.rgb.shape[:2]) / view.K[0, 0] for view in views if view.K_estimated]
-    if not middles:
-        return config
-    focal = config.start.focal_sigma
-    more = {"scale_sigma": focal, "warp_sigma": focal, "pointing_sigma_rad": max(middles)}
-    wider = {f"lifting.{name}": float(np.hypot(getattr(config.lifting, name), sigma)) for name, sigma in more.items()}
-    return config.replace(wider | {"alignment.depth_errors": True})
-
-
-def _estimated(
-    source: View, target: View, config: Config, prior: Prior | None, maps: PairMaps | None
-) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
-    checked_device(config.device)
-    spent, begin = {}, time.perf_counter()
-    try:
-        if maps is None and config.reconstruction.method == "two_view":
-            check_settings(config)
-            maps = NETWORKS.pair_maps(source.rgb, target.rgb, config)
-        views = with_depth((source, target), config, NETWORKS, maps)
-        if views != [source, target]:  # only a network takes time
-            spent["depth"], begin = time.perf_counter() - begin, time.perf_counter()
-        config = _doubting(config, *views)
-        x, y = mixtures_of(views, config, NETWORKS)
-    except (ModelError, ReconstructionError) as failure:
-        if isinstance(failure, (WeightsError, MissingDepthError)):
-            raise  # a mistake of whoever set this up, not of these images
-        return PoseEstimate(Status.NO_MIXTURE, str(failure)), None
-    spent["reconstruct"], begin = time.perf_counter() - begin, time.perf_counter()
-    try:
-        starts = initialise(views[0], views[1], config, prior, NETWORKS, maps)
-    except InitialisationError as failure:
-        spent["initialise"] = time.perf_counter() - begin
-        return PoseEstimate(Status.NO_INITIAL_POSE, str(failure), seconds=spent), (x, y)
-    spent["initialise"], begin = time.perf_counter() - begin, time.perf_counter()
-    estimate = best_of(x, y, starts, config)
-    estimate.seconds.update(spent, align=time.perf_counter() - begin)
-    return estimate, (x, y)
-
-
-def best_of(x: Mixture, y: Mixture, starts: tuple[Prior, ...], config: Config) -> PoseEstimate:
-    """The best estimate of several initial poses; where features led nowhere, also a search from identity is tried.
-
-    Args:
-        x, y: source and target, as `reconstruct` makes them.
-        starts: at least one, as `initialise` gives them.
-        config: as for `align_mixtures`.
-    """
-    estimates = [align_mixtures(x, y, start, config) for start in starts]
-    best = max(estimates, key=_merit)
-    may_search = config.start.method == "auto" and config.start.identity_fallback
-    if not best.ok and may_search and starts[0].origin == "features":
-        reason = f"from features: {best.status.value}, {best.reason}"
-        other = align_mixtures(x, y, identity(config, reason), config)
-        if not other.agreement < best.agreement:  # content with its own optimum is not enough
-            best = max(best, other, key=_merit)
-    return best
-
-
-def _merit(estimate: PoseEstimate) -> tuple[bool, bool, float]:
-    """Order of preference: a pose to use, then any pose, then quality."""
-    return estimate.ok, estimate.T_target_source is not None, estimate.quality
-
-
-def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:
-    """Align two mixtures from an initial pose, which counts as a measurement with its covariance.
-
-    Args:
-        source, target: each in its own camera's frame; a frustum, when present, is used to leave out what the
-            other camera cannot see.
-        initial: T_target_source and covariance to start from.
-        config: `config.alignment`, `device` and `dtype` are used; the default preset when None.
-    Returns:
-        PoseEstimate; `objective` is the mean of the two-way "log" objective, or the paper's log f.
-    Raises:
-        InputError: a mixture has fewer than 50 components.
-        ConfigError: the device is not there.
-    """
-    config = config or Config()
-    begin = time.perf_counter()
-    for name, mixture in (("source", source), ("target", target)):
-        if len(mixture) < MIN_ROWS:
-            raise InputError(
-                f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
-            )
-    estimate = _aligned(source, target, initial, config)
-    estimate.seconds["align"] = time.perf_counter() - begin
-    return estimate
-
-
-class _OneThread(ContextDecorator):
-    """Keep torch to the calling thread, for as long as any caller is inside.
-
-    Its helpers gain nothing on planes that fit the cache, and on a busy machine their busy-waiting makes every
-    operation many times slower. The number of threads is torch's own, one for the process: the first caller in notes
-    it, the last one out restores it.
-    """
-
-    _lock, _inside, _before = threading.Lock(), 0, 1
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if _OneThread._inside == 0:
-                _OneThread._before = torch.get_num_threads()
-                torch.set_num_threads(1)
-            _OneThread._inside += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            _OneThread._inside -= 1
-            if _OneThread._inside == 0:
-                torch.set_num_threads(_OneThread._before)
-
-
-@_OneThread()
-def _aligned(source: Mixture, target: Mixture, initial: Prior, config: Config) -> PoseEstimate:
-    x, y = to_device(source, config), to_device(target, config)
-    settings = config.alignment
-    known = _known(initial, config)
-    guess = relative_uncertainty(source, known.T, initial.covariance) > settings.guess_uncertainty
-    maximise = paper.maximise if settings.solver == "adam" else search if guess else ladder.anneal
-    findings = []
-    for solution in maximise(x, y, known, settings):
-        findings.append(_finding(solution, x, y, known, guess, config))
-        if findings[-1].convincing(settings):
-            break
-    if not findings:
-        shared = overlap(x, y, known.T, settings)
-        return _too_little(shared, initial, settings)
-    best = max(findings, key=lambda finding: finding.merit)
-    if best.overlap < settings.min_overlap:
-        return _too_little(best.overlap, initial, settings)
-    uncertainty = relative_uncertainty(source, best.T, best.covariance)
-    status, reason = verdict(best, initial, guess, uncertainty, settings)
-    return PoseEstimate(
-        status,
-        reason,
-        best.T,
-        best.covariance,
-        initial,
-        best.overlap,
-        best.solution.iterations,
-        best.solution.data.value,
-        quality(best, guess),
-        float("nan") if best.seen is None else best.merit,
-    )
-
-
-def _too_little(shared: float, initial: Prior, settings: Alignment) -> PoseEstimate:
-    reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
-    if shared >= settings.min_overlap:  # then the solver gave up
-        reason = f"fewer than {MIN_ROWS} components were left that both views see, of {shared:.0%} they share"
-    return PoseEstimate(Status.LOW_OVERLAP, reason, initial=initial, overlap=shared)
-
-
-def _known(initial: Prior, config: Config) -> WeightedStart:
-    """The initial pose as a measurement, and where they are solved for, what depth maps usually get wrong."""
-    precision = np.linalg.inv(twist_from_ros(initial.covariance, initial.T_target_source))
-    of_errors = np.zeros(0)
-    if config.alignment.depth_errors and config.alignment.solver != "adam":
-        of_errors = np.tile(1 / np.maximum(error_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
-    return WeightedStart(initial.T_target_source, np.asarray(precision, np.float64), of_errors)
-
-
-def _of_one_scale(covariance: Array, T: Array, sigma: float) -> Array:
-    """With an error of scale that both depth maps and the start share, so that nothing in the pair can show it."""
-    along = np.concatenate([T[:3, 3], np.zeros(3)])
-    return np.asarray(covariance + sigma**2 * np.outer(along, along))
-
-
-def _finding(
-    solution: Solution, x: DeviceMixture, y: DeviceMixture, known: WeightedStart, guess: bool, config: Config
-) -> Finding:
-    """A solution with its covariance, sharpened by brightness where the mixtures come with any."""
-    settings, T = config.alignment, solution.T
-    covariance, kept, seen = pose_covariance(solution, known, config.lifting), np.eye(6), None
-    if x.frustum is not None and y.frustum is not None:
-        prior = twist_from_ros(covariance, T) * (SEARCHED_SIGMAS**2 if guess else 1.0)
-        seen = fit_brightness(
-            x.frustum, y.frustum, T, prior, settings.brightness_measurements, error_sigmas(config.lifting)
-        )
-    if seen is not None and settings.brightness_measurements > 0:
-        T, covariance, kept = seen.T, ros_from_twist(seen.covariance, seen.T), seen.kept
-    if config.lifting.sigma_inflation > 1:
-        of_known = ros_from_twist(kept @ share_of_known(solution, known) @ kept.T, T)
-        covariance = inflated(covariance, of_known, config.lifting.sigma_inflation)
-    common = config.lifting.common_scale_sigma
-    if config.reconstruction.method == "two_view":
-        common = config.start.network_scale_sigma
-    if common > 0:
-        covariance = _of_one_scale(covariance, T, common)
-    return Finding(solution, T, covariance, overlap(x, y, T, settings), seen)
+    return Estimator(config, NETWORKS).estimate(source, target, prior)

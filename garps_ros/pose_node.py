@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ros2 run garps_ros pose_node`: starts the node, and ends it in good order on SIGINT and SIGTERM.
+"""Command `ros2 run garps_ros pose_node`: starts the node, and ends it in good order on SIGINT and SIGTERM.
 
 Exit code 0 = asked to stop, 1 = stalled (see STALL_S), 2 = wrong parameters, weights that are missing, or no rclpy;
 128 + n on a second signal.
@@ -18,13 +18,13 @@ from typing import Any
 
 NAME = "pose_node"
 SPIN_S = 0.2
-"""A signal is noticed at the latest after this; Python's handlers do not run while the executor waits."""
+"""Longest wait of the executor, s; Python's signal handlers do not run meanwhile."""
 PATIENCE_S = 3.0
-"""How long a computation may go on after a signal before the process ends without it."""
+"""Time that a computation may go on after a signal before the process ends without it, s."""
 STALL_S = 20.0
-"""When the loop has not come round for so long the process ends and says where it was; a launch file starts it again.
+"""Time without a turn of the loop after which the process ends and says where it was, s; a launch file restarts it.
 
-Its callbacks take milliseconds, so that is not the node's doing: a reader of Fast DDS 2.14 can loop for ever inside
+Callbacks take milliseconds, so the node is not the cause: a reader of Fast DDS 2.14 can loop for ever inside
 the call that takes a message, where neither Python's threads nor its signal handlers run. The watch is in C.
 """
 
@@ -62,7 +62,7 @@ examples:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node until a signal; returns the exit code."""
+    """Run the node until a signal; return the exit code."""
     words = sys.argv if arguments is None else [NAME, *arguments]
     if {"-h", "--help"} & set(words[1:]):
         print(HELP, end="")
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _start(words: list[str]) -> tuple[Any, Any, Any]:
-    """Executor, rclpy node and what runs in it."""
+    """Return the executor, the rclpy node and the PoseNode in it."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
@@ -106,7 +106,7 @@ def _start(words: list[str]) -> tuple[Any, Any, Any]:
 
 
 def _is_users(error: Exception) -> bool:
-    """Whether an error at the start is about what the user has given: arguments, parameters, names."""
+    """Tell whether an error at the start is about something that the user gave: arguments, parameters, names."""
     from rclpy import exceptions
 
     from garps_core.errors import ConfigError
@@ -117,7 +117,7 @@ def _is_users(error: Exception) -> bool:
 
 def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
     watched_s = -STALL_S
-    while not (stopped or node.refusal):
+    while not (stopped or node.start_error):
         if time.monotonic() - watched_s > 1.0:
             watched_s = time.monotonic()
             faulthandler.dump_traceback_later(STALL_S, exit=True)
@@ -126,7 +126,7 @@ def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
         except Exception as error:
             node.failed(error, traceback.format_exc())
     faulthandler.dump_traceback_later(STALL_S, exit=True)
-    code = _refuse(node.refusal) if node.refusal and not stopped else 0
+    code = _refuse(node.start_error) if node.start_error and not stopped else 0
     if not node.stop(PATIENCE_S):  # it goes on in native code; the interpreter cannot be taken down under it
         sys.stdout.flush()
         sys.stderr.flush()
@@ -137,7 +137,7 @@ def _run(executor: Any, ros: Any, node: Any, stopped: list[int]) -> int:
 
 
 def _stop_on_signals() -> list[int]:
-    """From now on the first SIGINT or SIGTERM is only noted in the list; the second ends the process at once."""
+    """Return a list that notes the first SIGINT or SIGTERM from now on; the second ends the process at once."""
     received: list[int] = []
 
     def note(number: int, _: FrameType | None) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`garps-replay`: relative poses from a recording, offline and without ROS; or the recording into a live ROS 2 graph.
+"""Command `garps-replay`: relative poses from a recording, without ROS; or the recording into a live ROS 2 graph.
 
 Exit code 0 = at least one pose, 1 = none, 2 = wrong input, 130 = interrupted (what was written is valid).
 """
@@ -17,15 +17,14 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from garps_core.align import estimate_relative_pose
+from garps_core.align import Estimator
 from garps_core.config import PRESETS, Config, methods
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.errors import GarpsError
 from garps_core.models.depth_networks import preset_for
-from garps_core.types import PoseEstimate, View
-from garps_ros.cameras import CameraTopics
+from garps_core.models.in_use import Networks
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker
-from garps_ros.estimates.outcomes import Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
+from garps_ros.estimates.outcomes import Completed, Origin, Outcome, ViewReader, estimate_keyframes, estimate_pairs
 from garps_ros.estimates.preparation import (
     check_method,
     completed,
@@ -34,6 +33,8 @@ from garps_ros.estimates.preparation import (
     needs_depth,
     settings_of_completed,
 )
+from garps_ros.frames.frame import CameraTopics
+from garps_ros.parameters.settings import RECTIFIED, NodeSettings, current_rectified
 from garps_ros.recording.bags import Bag, BagError
 from garps_ros.recording.frame_reader import Frames
 from garps_ros.recording.outputs import Outputs
@@ -45,10 +46,9 @@ from msg_adapters import NANOSECONDS
 NAME = "garps-replay"
 INTERRUPTED = 130
 ONE_OF_PAIRING = ("auto", "cameras", "keyframe")
-ONE_OF_RECTIFIED = ("auto", "true", "false")
 GIVEN = "COMMANDLINE"
 LIVE_OPTIONS = {"rate", "loop", "topics", "wait"}
-"""What goes with --to-ros, and with nothing else."""
+"""Options that need --to-ros."""
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]
@@ -57,7 +57,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code. A user's mistake is one line on stderr and code 2."""
+    """Run the command line; return the exit code. A user's mistake is one line on stderr and code 2."""
     try:
         code = app(args=arguments, prog_name=NAME, standalone_mode=False)
         return code if isinstance(code, int) else 0
@@ -103,6 +103,13 @@ Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupte
 With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong input, 130 = interrupted.
 """
 
+Rectified = Annotated[str, typer.Option(help="Kind of the images: rectified, raw, or auto (by topic name).")]
+KeyframeOverlap = Annotated[float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)]
+KeyframeMotion = Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)]
+KeyframeRotation = Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)]
+LostAfter = Annotated[
+    int, typer.Option(help="New trajectory after this number of frames in a row without a pose.", min=1, max=1000)
+]
 Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
 Reconstruction = Annotated[
     str | None, typer.Option(help=f"Whose depth, one of {', '.join(methods()[:-1])}. [auto: the depth topics]")
@@ -136,26 +143,21 @@ def replay(
     ] = "auto",
     slop: Annotated[
         float, typer.Option(help="Largest difference of stamps that belong together, seconds.", min=0, max=10)
-    ] = 0.02,
-    rectified: Annotated[
-        str, typer.Option(help="Are the images rectified? auto (by topic name), true, false.")
-    ] = "auto",
-    keyframe_overlap: Annotated[
-        float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)
-    ] = 0.5,
-    keyframe_motion: Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)] = 0.3,
-    keyframe_rotation: Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)] = 20.0,
-    keyframe_lost_after: Annotated[
-        int, typer.Option(help="New trajectory after so many frames in a row without a pose.", min=1, max=1000)
-    ] = 5,
+    ] = NodeSettings.sync_slop,
+    rectified: Rectified = NodeSettings.rectified,
+    keyframe_overlap: KeyframeOverlap = NodeSettings.keyframe_overlap,
+    keyframe_motion: KeyframeMotion = NodeSettings.keyframe_motion,
+    keyframe_rotation: KeyframeRotation = NodeSettings.keyframe_rotation,
+    keyframe_lost_after: LostAfter = NodeSettings.keyframe_lost_after,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Preset = None,
     reconstruction: Reconstruction = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+        list[str] | None,
+        typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
     ] = None,
     settings: Annotated[
-        Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+        Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
     ] = None,
     to_ros: ToRos = False,
     rate: Rate = 1.0,
@@ -168,7 +170,8 @@ def replay(
     if to_ros:
         return _play(bag, rate, loop, topics or [], wait)
     _check_choice("--pairing", pairing, ONE_OF_PAIRING)
-    _check_choice("--rectified", rectified, ONE_OF_RECTIFIED)
+    rectified = current_rectified(rectified)
+    _check_choice("--rectified", rectified, RECTIFIED)
     config = _configured(preset, reconstruction, settings, set_ or [])
     rule = KeyframeRule(
         keyframe_overlap, keyframe_motion, math.radians(keyframe_rotation), keyframe_lost_after, depth_share(config)
@@ -177,26 +180,27 @@ def replay(
     target = CameraTopics(target_image, target_info, target_depth)
     with Bag(bag) as recording:
         cameras = choose_cameras(recording, source, target, pairing, needs_depth(config))
-        load_networks(config, lambda text: print(text, file=sys.stderr))
+        networks = Networks()
+        load_networks(config, lambda text: print(text, file=sys.stderr), networks)
         with Outputs(out, overwrite) as outputs:
-            return _run(recording, cameras, outputs, config, rule, round(slop * NANOSECONDS), rectified, limit)
+            estimator = Estimator(config if len(cameras) == 2 else settings_of_completed(config), networks)
+            with_depth = partial(completed, config=config, networks=networks)
+            slop_ns = round(slop * NANOSECONDS)
+            return _run(recording, cameras, outputs, estimator, with_depth, rule, slop_ns, rectified, limit)
 
 
 def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
-    """The settings; of a network from the preset for its depth, where none is given."""
+    """Return the settings; where no preset is given, those of a network start from the preset for its depth."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
-
-    def changed(base: Config) -> Config:
-        return changed_config(base if file is None else read_settings(file, base), changes)
-
-    asked = changed(Config())
-    config = changed(Config.preset(preset or preset_for(asked.reconstruction.method, needs_depth(asked))))
+    config = configured(
+        preset, file, changes, lambda asked: preset_for(asked.reconstruction.method, needs_depth(asked))
+    )
     check_method(config)
     return config
 
 
 def _check_given(context: typer.Context, to_ros: bool) -> None:
-    """Options of the one way to replay do not go with the other."""
+    """Refuse options of the offline replay with --to-ros, and the other way round."""
     given = {name for name in context.params if getattr(context.get_parameter_source(name), "name", "") == GIVEN}
     wrong = given - LIVE_OPTIONS - {"bag", "to_ros"} if to_ros else given & LIVE_OPTIONS
     if wrong:
@@ -221,7 +225,8 @@ def _run(
     bag: Bag,
     cameras: list[CameraTopics],
     outputs: Outputs,
-    config: Config,
+    estimator: Estimator,
+    with_depth: Completed,
     rule: KeyframeRule,
     slop_ns: int,
     rectified: str,
@@ -235,7 +240,7 @@ def _run(
         with Progress(console=console, transient=True) as progress:
             say = console.print
             _say_choice(cameras, say)
-            outcomes = _outcomes(frames, ViewReader(rectified, say), config, rule, len(cameras))
+            outcomes = _outcomes(frames, ViewReader(rectified, say), estimator, with_depth, rule, len(cameras))
             expected = min(bag.counts[cameras[0].image], limit or sys.maxsize)
             record(progress.track(outcomes, expected, description="frames"), outputs, summary, stopped, limit)
         summary.unpaired, summary.broken_end = frames.unpaired(), bag.broken_end
@@ -244,17 +249,16 @@ def _run(
 
 
 def _outcomes(
-    frames: Frames, reader: ViewReader, config: Config, rule: KeyframeRule, cameras: int
+    frames: Frames,
+    reader: ViewReader,
+    estimator: Estimator,
+    with_depth: Completed,
+    rule: KeyframeRule,
+    cameras: int,
 ) -> Iterator[Origin | Outcome]:
-    used = config if cameras == 2 else settings_of_completed(config)
-
-    def estimate(source: View, target: View) -> PoseEstimate:
-        return estimate_relative_pose(source, target, used)
-
     if cameras == 2:
-        return estimate_pairs(frames.pairs(), reader, estimate)
-    with_depth = partial(completed, config=config)
-    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimate, rule), with_depth)
+        return estimate_pairs(frames.pairs(), reader, estimator.estimate)
+    return estimate_keyframes(frames.singles(), reader, KeyframeTracker(estimator.estimate, rule), with_depth)
 
 
 def _say_choice(cameras: list[CameraTopics], say: Callable[[str], None]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose node of one pair of cameras, on a robot. Arguments: ros2 launch garps_ros garps.launch.py --show-args.
+"""Launch file of the pose node for one pair of cameras. Arguments: ros2 launch garps_ros garps.launch.py --show-args.
 
 Example: ros2 launch garps_ros garps.launch.py source_image:=/left/image_rect source_depth:=/left/depth_registered
          target_image:=/right/image_rect target_depth:=/right/depth_registered target_frame:=right_optical rviz:=true
@@ -16,7 +16,7 @@ from launch import LaunchContext, LaunchDescription
 
 SHARE = Path(__file__).absolute().parent.parent  # share/garps_ros; in the source tree it looks the same from here
 LARGE_IMAGES = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(SHARE / "config" / "fastdds_large_images.xml")}
-AS_IN_FILE = "as params_file says"
+AS_IN_FILE = "as in params_file"
 YES_NO = ("true", "false")
 
 ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
@@ -87,7 +87,7 @@ ARGUMENTS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What `ros2 launch` runs."""
+    """Return the description that `ros2 launch` runs."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=list(choices) or None)
         for name, default, choices, text in ARGUMENTS
@@ -96,7 +96,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def start(context: LaunchContext) -> list[Node | LogInfo]:
-    """The node, and RViz where it is wanted, from the arguments as they were given."""
+    """Return the node, and RViz if it is wanted, from the arguments as they were given."""
     given = {name: context.launch_configurations[name] for name, *_ in ARGUMENTS}
     node = Node(
         package="garps_ros",
@@ -114,7 +114,7 @@ def start(context: LaunchContext) -> list[Node | LogInfo]:
 
 
 def remappings(given: dict[str, str]) -> list[tuple[str, str]]:
-    """From the names in the node to the topics that were asked for."""
+    """Return pairs of a name in the node and the topic that was asked for."""
     pairs = []
     for camera in ("source", "target"):
         image = given[f"{camera}_image"]
@@ -128,7 +128,7 @@ def remappings(given: dict[str, str]) -> list[tuple[str, str]]:
 
 
 def parameters(given: dict[str, str]) -> dict[str, str | bool]:
-    """What goes over the parameter file: only what was given, so that the file keeps its say on the rest."""
+    """Return the parameters that were given; the parameter file decides on all others."""
     texts = {name: given[name] for name in ("image_transport", "pairing", "preset", "target_frame") if given[name]}
     if given["reconstruction"]:
         texts["reconstruction.method"] = given["reconstruction"]
@@ -137,12 +137,12 @@ def parameters(given: dict[str, str]) -> dict[str, str | bool]:
 
 
 def environment(given: dict[str, str]) -> dict[str, str]:
-    """Variables of the processes started here, beyond those of the shell."""
+    """Return environment variables of the processes started here, in addition to the shell's."""
     return LARGE_IMAGES if given["large_images"] == "true" else {}
 
 
 def viewer(given: dict[str, str]) -> list[Node | LogInfo]:
-    """RViz with the names of rviz/garps.rviz led to the topics of this launch."""
+    """Return RViz, with the names of rviz/garps.rviz remapped to the topics of this launch."""
     frame = given["target_frame"]
     base = "/" + given["namespace"].strip("/") if given["namespace"].strip("/") else ""
     images = [(f"/{name}", to if to.startswith("/") else f"{base}/{to}") for name, to in remappings(given)]

@@ -76,7 +76,7 @@ def millimetres_to_metres(samples: npt.NDArray[np.uint16]) -> npt.NDArray[np.flo
 
 
 def _inverse_depth(samples: npt.NDArray[np.uint16], a: float, b: float) -> npt.NDArray[np.float32]:
-    """depth = a / (sample - b) metres, sample 0 = none (compressed_depth_image_transport, codec.cpp)."""
+    """Metres: `depth = a / (sample - b)`, sample 0 = none (compressed_depth_image_transport, codec.cpp)."""
     if not (np.isfinite([a, b]).all() and a > 0 and b < 1):
         raise MessageError(
             f"compressedDepth header has parameters {a:g}, {b:g}: expected finite, first > 0, second < 1"

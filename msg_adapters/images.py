@@ -26,7 +26,7 @@ MIN_BAYER_PX = 4
 
 @dataclass(frozen=True)
 class _Layout:
-    """How one pixel lies in memory: bytes per sample, samples, which of them are red, green, blue; or a mosaic."""
+    """Layout of one pixel in memory: bytes per sample, samples, which of them are red, green, blue; or a mosaic."""
 
     sample: str
     channels: int

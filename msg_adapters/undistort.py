@@ -31,7 +31,7 @@ def undistorted_pair(
 def _tables(
     k: tuple[float, ...], model: str, coefficients: tuple[float, ...], width: int, height: int
 ) -> tuple[Array, Array]:
-    """Where each pixel of the pinhole image lies in the distorted one, HxW float32 x and y."""
+    """Positions of the pinhole image's pixels in the distorted one, HxW float32 x and y."""
     import cv2
 
     K, D, still = np.array(k).reshape(3, 3), np.array(coefficients), np.eye(3)

@@ -35,20 +35,19 @@ from bench.demo.picture import with_inputs
 from bench.demo.rgb import rgb_part
 from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
 from bench.rooms import RoomPair, make_pair
-from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics
+from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
 from garps_ros.replay import main as replay
 
 if TYPE_CHECKING:
-    from bench.demo.live import LivePose  # needs rclpy
+    from bench.demo.live import LivePose
 
 LIMIT_MM = 5.0
 """Median error of the estimated baseline above which the demo fails."""
 PICTURE = "bedroom_chair"
 ROOM_SEED, ROOM_LEVEL = 3, 4
 ROUGH_M, ROUGH_DEG = 0.12, 3.0
-"""How far the room's rough start is off."""
+"""Error of the room's rough start."""
 
 Array = npt.NDArray[np.float64]
 console = Console()
@@ -65,7 +64,7 @@ class Estimate:
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the bag, poses.csv and the pictures.")] = Path("out/demo"),
-    scenes: Annotated[int, typer.Option(help="Use the first so many stereo pairs.", min=1)] = 12,
+    scenes: Annotated[int, typer.Option(help="Number of stereo pairs, from the first on.", min=1)] = 12,
 ) -> int:
     """Run all parts; exit code 0 when the median baseline error is below the limit, offline and live."""
     begin = time.perf_counter()

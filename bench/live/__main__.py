@@ -35,9 +35,13 @@ from bench.rooms import RoomPair, make_pair
 from msg_adapters import ns_to_stamp, stamp_to_ns
 
 ROOM_SEED, ROOM_LEVEL = 3, 2
-SLOW = ["lifting.stride:=1", "alignment.solver:=adam"]
+SLOW = (
+    "lifting.stride: 1\nmethod: paper\npaper.steps: 8\npaper.neighbours: 20\n"
+    "paper.opacity_threshold: 0.0\npaper.component_stride: 1\n"
+)
 """Settings under which a pair of 640x480 takes 1.5 s and more on two cores; nobody would want them."""
-CHEAP = ["lifting.stride:=8", "start.max_features:=300"]
+CHEAP = "lifting.stride: 8\nstart.max_features: 300\n"
+"""Settings under which the estimate takes little beside what is measured."""
 WARM_UP = 3
 ANSWER_S, START_S = 20.0, 60.0
 LAST_DELAY = "target/depth delay p50 / max (ms)"
@@ -46,7 +50,7 @@ console = Console()
 
 @dataclass
 class Answers:
-    """What has come from the node."""
+    """Messages that have come from the node."""
 
     poses_s: dict[int, float] = field(default_factory=dict)
     """Arrival (steady time, s) by stamp, ns."""
@@ -125,12 +129,13 @@ def camera_info(K: Any, shape: tuple[int, ...]) -> CameraInfo:
 
 
 @contextmanager
-def rig(settings: list[str], width: int, height: int) -> Iterator[tuple[Listener, Cameras, Answers]]:
-    """A node with settings, its cameras, and what it answers; all matched and warmed up."""
-    words = [word for setting in settings for word in ("-p", setting)]
-    log = Path(tempfile.mkdtemp(prefix="garps_live_")) / "node.log"
+def rig(settings: str, width: int, height: int) -> Iterator[tuple[Listener, Cameras, Answers]]:
+    """Start a node with the text of a settings file, and its cameras; yield what it answers, all warmed up."""
+    folder = Path(tempfile.mkdtemp(prefix="garps_live_"))
+    file, log = folder / "settings.yaml", folder / "node.log"
+    file.write_text(settings, encoding="utf-8")
     with private_domain(), log.open("w", encoding="utf-8") as output, listener("bench") as heard:
-        node = start("garps_ros.pose_node", ["--ros-args", *words] if words else [], output)
+        node = start("garps_ros.pose_node", ["--ros-args", "-p", f"settings_file:={file}"], output)
         try:
             cameras = Cameras(heard, make_pair(ROOM_SEED, ROOM_LEVEL, width=width, height=height))
             answers = Answers()

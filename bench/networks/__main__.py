@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the networks cost on this machine's CPU, and how close they come to its own matrix multiplication.
+"""Cost of the networks on this machine's CPU, and how close they come to its own matrix multiplication.
 
     python -m bench.networks [--only depth-anything,flash3d] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
 
@@ -23,15 +23,15 @@ import numpy as np
 import torch
 import typer
 from rich.console import Console
-from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from bench.networks.pair import pair_lines, peak_mib, seconds_of
-from bench.scoring.tables import machine_facts
-from bench.speed.parts import Check, Row, Section, markdown, print_section
+from bench.machine.cost import peak_mib, seconds_of
+from bench.machine.facts import machine_facts
+from bench.machine.flop import Call, counted_flop
+from bench.networks.pair import pair_lines
+from bench.report.checks import Check, Row, Section, markdown, print_section
 
-Call = Callable[[], Any]
 BAR_SHARE = 0.5
-"""Of the multiplication's throughput: the least that the default depth network must reach on two images."""
+"""Least share of the multiplication's throughput that the default depth network must reach on two images."""
 MATRIX = 2048
 """Rows and columns of the multiplied matrices."""
 MULTIPLICATIONS = 4
@@ -40,7 +40,7 @@ MULTIPLICATIONS = 4
 
 @dataclass(frozen=True)
 class Case:
-    """One line of the table: a network of one size on so many images of one size."""
+    """One line of the table: a network of one size on images of one size."""
 
     network: str
     size: str
@@ -125,18 +125,6 @@ def measured(case: Case, runs: int, threads: int) -> Row:
     images = f"{case.images} of {case.rows}x{case.columns}"
     names = {"network": f"{case.network} {case.size}".strip(), "images": images, "inside": inside}
     return names | told | {"peak MiB": peak, "beyond imports MiB": peak - imported, "GFLOP": flop / 1e9}
-
-
-def counted_flop(call: Call) -> int:
-    """Floating-point operations of matrix products, convolutions and attention in a call; a multiply-add is two."""
-    attention = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flop}
-    with FlopCounterMode(display=False, custom_mapping=attention) as counter:
-        call()
-    return int(counter.get_total_flops())
-
-
-def _attention_flop(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    return int(sdpa_flop_count(query, key, value))
 
 
 def _round(call: Call, flop: int) -> dict[str, float]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of a whole pair goes that comes without depth: both depths, mixtures, start, alignment.
+"""Time of each stage of a whole pair that comes without depth: both depths, mixtures, start, alignment.
 
 The weights are random, so the depth network computes all it has to, and then its output is replaced by a generated
 room's depth as such a network gives it. Otherwise the other stages would have nothing to work on. Flash3D keeps its own
@@ -9,10 +9,8 @@ output, which means nothing: with it the start and the alignment cost what they 
 from __future__ import annotations
 
 import os
-import resource
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,8 +20,9 @@ import cv2
 import numpy as np
 import torch
 
+from bench.machine.cost import peak_mib, seconds_of
+from bench.report.checks import Row
 from bench.rooms import RoomPair, make_pair
-from bench.speed.parts import Row
 from garps_core import Config, PoseEstimate, View, estimate_relative_pose
 from garps_core.align import NETWORKS
 from garps_core.models.depth_anything import DepthAnythingV2
@@ -36,10 +35,12 @@ ROOM = 3
 """Seed of the room; its views are 0.25 m and 10 degrees apart."""
 
 
-def install(folder: Path) -> None:
-    """Random weights of both networks, where GARPS looks for them from now on."""
-    made = {"depth-anything-v2-indoor-small": DepthAnythingV2("vits", 20.0), "flash3d": Flash3D()}
-    for name, network in made.items():
+def install(folder: Path, method: str) -> None:
+    """Put random weights of the networks that a method needs where GARPS looks for them from now on."""
+    networks: dict[str, torch.nn.Module] = {"depth-anything-v2-indoor-small": DepthAnythingV2("vits", 20.0)}
+    if method == "flash3d":
+        networks["flash3d"] = Flash3D()
+    for name, network in networks.items():
         torch.save(network.state_dict(), folder / BY_NAME[name].local)
     os.environ["GARPS_WEIGHTS"] = str(folder)
 
@@ -67,7 +68,7 @@ def measured_pair(method: str, runs: int, threads: int) -> Row:
     config = Config.preset("monocular").replace({"reconstruction.method": method})
     found: list[PoseEstimate] = []
     with tempfile.TemporaryDirectory() as folder:
-        install(Path(folder))
+        install(Path(folder), method)
         NETWORKS.depth_network(config).register_forward_hook(answering((pair.depth0, pair.depth1)))
 
         def call() -> None:
@@ -80,18 +81,6 @@ def measured_pair(method: str, runs: int, threads: int) -> Row:
     wall, cpu = (statistics.median(one[i] for one in whole) for i in (0, 1))
     told = {"wall s": wall, "CPU s": cpu, "peak MiB": peak, "beyond imports MiB": peak - imported}
     return {"reconstruction.method": method} | stages | told | {"status": found[-1].status.value}
-
-
-def seconds_of(action: Callable[[], Any]) -> tuple[float, float]:
-    """Wall and CPU seconds, the latter of all threads."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    action()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def peak_mib() -> float:
-    """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def pair_lines(runs: int, threads: int) -> list[Row]:

@@ -4,7 +4,7 @@
     python -m bench.pairs.learned_rooms
 
 Seeds are not those of the rooms to learn from (`bench.training.rooms`). Levels (`bench.rooms.LEVELS`: 5 deg and 0.1 m
-to 35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.sources.with_depth_of` puts a network's
+to 35 deg and 1 m) and kinds take turns. Depth is the truth's here; `bench.pairs.depths.with_depth_of` puts a network's
 in its place.
 """
 
@@ -20,16 +20,17 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from bench.pairs.bare import in_the_dark, matches
-from bench.pairs.datasets import Pair, scene_points
+from bench.machine.jobs import computed
+from bench.pairs.bare_rooms import matches
+from bench.pairs.pair import Pair, scene_points
 from bench.rooms import LEVELS, make_pair
-from bench.rows.jobs import computed
+from bench.rooms.dark import in_the_dark
 from garps_core import View
 
 SET = "learned_rooms"
 FOLDER = Path("out/learned_rooms")
 KINDS = {"rich": 1.0, "medium": 0.4, "plain": 0.0, "dark": 0.0}
-"""Texture of each; dark is plain, in dim light from a moving camera (`bench.pairs.bare.in_the_dark`)."""
+"""Texture of each; dark is plain, in dim light from a moving camera (`bench.rooms.dark.in_the_dark`)."""
 SPLITS = {"tune": range(91_000, 91_060), "report": range(92_000, 92_200)}
 VERSION = 1
 
@@ -53,7 +54,7 @@ def load(split: str, folder: Path, console: Console, workers: int = 2, limit: in
     if split not in SPLITS:
         raise ValueError(f"split is {split!r}: expected one of {', '.join(SPLITS)}")
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = list(SPLITS[split])[:limit]  # levels and kinds take turns, so that any beginning holds all of them
+    seeds = list(SPLITS[split])[:limit]  # levels and kinds take turns, so that the first few hold all of them
     with Progress(console=console) as bars:
         paths = computed(partial(stored, folder=folder), seeds, workers)
         return [
@@ -94,7 +95,7 @@ def _read(seed: int, path: Path) -> Pair:
 
 
 def few_matches(pairs: Sequence[Pair], limit: int) -> int:
-    """How many have fewer matches of features than that."""
+    """Number of pairs with fewer feature matches than the limit."""
     return sum(matches(pair) < limit for pair in pairs)
 
 

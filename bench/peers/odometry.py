@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """RGB-D odometry of Open3D: direct alignment of two images with depth, coarse to fine, from a start pose.
 
-The older of Open3D's two implementations: from the starts of `bench.pairs.datasets` it ends nearer to the truth than
+The older of Open3D's two implementations: from the starts of `bench.pairs.starts` it ends nearer to the truth than
 the tensor one does with any number of levels and iterations.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What GARPS loses or gains without one of its parts: the layout of the published ablation, with intervals."""
+"""Ablations of GARPS in the layout of the published one, with intervals."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bench.rows.row import GARPS, Row
 from bench.rows.variants import VARIANTS
 from bench.scoring.intervals import relative_change
-from bench.scoring.tables import GARPS, Row
 
 ERRORS = {"e_trans_m": "E_trans", "e_rot_deg": "E_rot", "e_3d_m": "E_3D"}
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Markdown tables in the layout of the paper, and those it lacks: of all pairs, paired, by category, by length.
 
-Rows are those of `bench.rows.evaluate`. The paper's numbers are over each method's own successes, and cannot be
+Rows are those of `bench.rows.pair_rows`. The paper's numbers are over each method's own successes, and cannot be
 compared where methods fail on different pairs; so every table says how many pairs and failures it is of, and where the
 unit of the true translations comes from. The best of a column, as rounded, is bold. A table of no rows is empty text.
 """
@@ -16,9 +16,10 @@ import numpy as np
 from scipy.stats import binomtest
 
 from bench.report.ablations import ERRORS
+from bench.rows.row import GARPS, Row
 from bench.scoring.intervals import paired_difference
 from bench.scoring.scores import INF, THRESHOLDS_DEG, VCRE_PX, precision_auc
-from bench.scoring.statistics_blocks import (
+from bench.scoring.statistics import (
     MAA_DEG,
     all_pairs,
     common_subset,
@@ -33,7 +34,7 @@ from bench.scoring.statistics_blocks import (
     scale_sources,
     spread,
 )
-from bench.scoring.tables import GARPS, MAP_FREE_DEG, MAP_FREE_M, Row
+from bench.scoring.summary import MAP_FREE_DEG, MAP_FREE_M
 from garps_core.checks import Float64Array
 
 ALL_PAIRS = {"e_rot_deg": "E_rot", "e_dir_deg": "E_dir", "e_trans_m": "E_trans", "e_3d_m": "E_3D"}
@@ -42,7 +43,7 @@ TIME = (
     "one call from the images, without the depth that the pair has and without a start that is given; mean over the "
     "pairs, failures too"
 )
-"""What is inside the seconds of rows that `bench.rows.evaluate` made."""
+"""Meaning of the seconds of rows that `bench.rows.pair_rows` made."""
 LENGTH_FROM_DEPTH = ("five-point", "colmap", "colmap-relaxed")
 """Methods that find a direction, and take the length of t from the depth of the pair (`bench.peers.metres`)."""
 COUNTS = ("n poses", "Failures")
@@ -137,7 +138,7 @@ def difference_table(rows: Sequence[Row], method: str = GARPS, error: str = "e_3
 
 
 def _differences(ours: Float64Array, theirs: Float64Array) -> list[str]:
-    """Of the pairs in which both errors are finite: their number, median and mean of the paired differences."""
+    """Number of pairs in which both errors are finite, median and mean of their paired differences."""
     both = np.isfinite(ours) & np.isfinite(theirs)
     if not both.any():
         return ["0", "-", "-"]
@@ -211,7 +212,7 @@ def _precision(rows: Sequence[Row], accepts: Callable[[Row], bool]) -> tuple[flo
 
 
 def note(rows: Iterable[Row]) -> str:
-    """What stands below a table: scale of the truth per set, number of pairs, borrowed lengths."""
+    """Notes below a table: scale of the truth per set, number of pairs, borrowed lengths."""
     rows = list(rows)
     sets = dict.fromkeys(row["set"] for row in rows)
     sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
@@ -251,7 +252,7 @@ def _counts(rows: Sequence[Row]) -> list[str]:
 
 
 def _spread_columns(rows: Sequence[Row], middle: str, width: str) -> dict[str, list[str]]:
-    """Of every error "middle ± width", two fields of `Spread`; with n where it is not that of the poses."""
+    """Each error as "middle ± width", two fields of `Spread`, with n where it is not that of the poses."""
     columns = {}
     for error in ERRORS:
         digits, values, texts = _digits(error), [], []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a run, one function each, from the rows of `bench.rows.evaluate` to a PNG file.
+"""Pictures of a run, one function each, from the rows of `bench.rows.pair_rows` to a PNG file.
 
 Rows of one table belong into a picture: one depth, set and start (`write_plots` tells them apart). A method looks the
 same in every picture; colours are those of Okabe and Ito, which the colour-blind can tell apart. All pairs count,
@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import binomtest, chi2
 
+from bench.rows.row import GARPS, START, Row
 from bench.scoring.scores import NAN
-from bench.scoring.statistics_blocks import errors_of, length_unit, median_of_all, methods_of, pair_of, rows_of, spread
-from bench.scoring.tables import GARPS, START, SUCCESS_DEG, SUCCESS_M, Row, is_right
+from bench.scoring.statistics import errors_of, length_unit, median_of_all, methods_of, pair_of, rows_of, spread
+from bench.scoring.summary import SUCCESS_DEG, SUCCESS_M, is_right
 from garps_core.checks import Float64Array
 
 if TYPE_CHECKING:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run of `bench.run` leaves behind: rows, tables, plots, and pictures of pairs before and after."""
+"""The folder of a run of `bench.run`: rows, tables, plots, and pictures of pairs before and after."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bench.pairs.datasets import Pair
-from bench.pairs.sources import with_depth_of
+from bench.pairs.depths import with_depth_of
+from bench.pairs.pair import Pair
 from bench.report import acceptance
 from bench.report.ablations import ablation_tables
+from bench.report.depth_tables import depth_tables
 from bench.report.paper_tables import paper_tables
 from bench.report.plots import write_plots
-from bench.scoring.depth_errors import depth_tables
-from bench.scoring.statistics_blocks import pair_of
-from bench.scoring.tables import GARPS, START, Row, print_tables, write
-from garps_core import Config
+from bench.report.run_tables import print_tables, write
+from bench.rows.row import GARPS, START, Row
+from bench.scoring.statistics import pair_of
+from garps_core import Config, reconstruct
 from garps_core.cli.figure import before_after
-from garps_core.mixtures import reconstruct
 
 MAX_PICTURES = 8
 

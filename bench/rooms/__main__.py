@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.rooms.mesh import LABELS
-from bench.rooms.pair import DEPTH_NOISES, LEVELS, RoomPair, make_pair
+from bench.rooms.room_pair import DEPTH_NOISES, LEVELS, RoomPair, make_pair
 
 
 def depth_picture(depth: npt.NDArray[np.float32], far_m: float) -> npt.NDArray[np.uint8]:

@@ -6,17 +6,12 @@ A surface point has one colour whatever camera looks at it: textures live on sur
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:
-    from bench.rooms.mesh import Array
-    from bench.rooms.render import Hits, Room
-
-Float32Array = npt.NDArray[np.float32]
+from bench.rooms.mesh import Array
+from bench.rooms.scene import Float32Array, Hits, Scene
 
 TILE = 4  # shadow rays use 16 light points and directions, a different one at each place of a 4x4 tile
 AMBIENT = np.array([0.40, 0.41, 0.43], np.float32)
@@ -27,7 +22,7 @@ TO_LINEAR = ((np.arange(256) / 255) ** 2.2).astype(np.float32)
 
 
 def radiance(
-    room: Room, T: Array, K: Array, width: int, height: int, samples: int, centre: Hits | None = None
+    room: Scene, T: Array, K: Array, width: int, height: int, samples: int, centre: Hits | None = None
 ) -> Float32Array:
     """HxWx3 linear light that reaches the camera at T_world_camera, mean over samples x samples rays per pixel.
 
@@ -46,7 +41,7 @@ def radiance(
 
 
 def _band(
-    room: Room,
+    room: Scene,
     T: Array,
     K: Array,
     size: tuple[int, int],
@@ -81,7 +76,7 @@ def camera_rays(K: Array, width: int, height: int, samples: int = 1) -> Float32A
 
 
 def _pixel_visibility(
-    room: Room, T: Array, K: Array, size: tuple[int, int], hits: Hits | None
+    room: Scene, T: Array, K: Array, size: tuple[int, int], hits: Hits | None
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Patch ids HxW at the pixel centres, and their visibility (H W)x(1+L)."""
     height, width = size
@@ -111,7 +106,7 @@ def _source(patch: npt.NDArray[np.int32], fine: npt.NDArray[np.int32], samples: 
     return source
 
 
-def _normals(room: Room, hits: Hits, face: npt.NDArray[np.int64], rays: Float32Array) -> Float32Array:
+def _normals(room: Scene, hits: Hits, face: npt.NDArray[np.int64], rays: Float32Array) -> Float32Array:
     """Nx3 unit shading normals that look towards the camera."""
     corner = room.normals[:, 0]
     out = corner[face]
@@ -125,7 +120,7 @@ def _normals(room: Room, hits: Hits, face: npt.NDArray[np.int64], rays: Float32A
 
 
 def _surface(
-    room: Room, hits: Hits, face: npt.NDArray[np.int64], normals: Float32Array, rays: Float32Array, pixel: float
+    room: Scene, hits: Hits, face: npt.NDArray[np.int64], normals: Float32Array, rays: Float32Array, pixel: float
 ) -> tuple[Float32Array, Float32Array]:
     """Linear albedo Nx3 and glow N; the mip level follows the size of a sample on the surface."""
     corner = room.uv
@@ -149,7 +144,7 @@ def _surface(
     return TO_LINEAR[colour], glow / np.float32(room.gain)
 
 
-def _visibility(room: Room, points: Float32Array, normals: Float32Array, patch: npt.NDArray[np.int32]) -> Float32Array:
+def _visibility(room: Scene, points: Float32Array, normals: Float32Array, patch: npt.NDArray[np.int32]) -> Float32Array:
     """Nx(1+L), 0..1: openness to the surroundings and to each light of N = HxW points, shared within 4x4 tiles."""
     height, width = patch.shape
     y, x = np.arange(height)[:, None] % TILE, np.arange(width)[None, :] % TILE
@@ -162,7 +157,7 @@ def _visibility(room: Room, points: Float32Array, normals: Float32Array, patch: 
     return _share(np.stack(layers, axis=-1).reshape(height, width, -1), patch).reshape(height * width, -1)
 
 
-def _irradiance(room: Room, points: Float32Array, normals: Float32Array, open_to: Float32Array) -> Float32Array:
+def _irradiance(room: Scene, points: Float32Array, normals: Float32Array, open_to: Float32Array) -> Float32Array:
     """Nx3 light that falls on N points with their visibility Nx(1+L)."""
     strength = [open_to[:, 0]]
     for k, light in enumerate(room.lights):
@@ -171,7 +166,7 @@ def _irradiance(room: Room, points: Float32Array, normals: Float32Array, open_to
     return np.stack(strength, axis=1) @ power
 
 
-def _ambient(room: Room, start: Float32Array, normals: Float32Array, turn: npt.NDArray[np.int64]) -> Float32Array:
+def _ambient(room: Scene, start: Float32Array, normals: Float32Array, turn: npt.NDArray[np.int64]) -> Float32Array:
     """N values 0..1: how open the half space is, from one cosine-distributed ray each."""
     k = np.arange(TILE**2)
     z = 1 - (2 * k + 1) / TILE**2
@@ -213,7 +208,7 @@ def _share(layers: Float32Array, patch: npt.NDArray[np.int32]) -> Float32Array:
     return layers
 
 
-def room_gain(room: Room) -> float:
+def room_gain(room: Scene) -> float:
     """Factor that brings the median surface of the room to a mid grey; one number for all cameras."""
     K = np.array([[24.0, 0, 23.5], [0, 24.0, 17.5], [0, 0, 1]])
     centre = np.array([*(0.5 * room.size[:2]), 1.5])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GARPS as it is, with something left out, or with something put in: what each part is worth.
+"""GARPS as it is, with a part left out, or with a part added.
 
 The published ablations are `garps-labels` against `garps` (segmentation; only where the truth has labels: an oracle's),
 `garps-isotropic` and `garps-no-colour`.
@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.pairs.datasets import Pair
-from bench.scoring.tables import GARPS
+from bench.pairs.pair import Pair
+from bench.rows.row import GARPS
 from garps_core import Config, Mixture, PoseEstimate, Prior, Status
-from garps_core.align import NETWORKS, best_of
+from garps_core.align import NETWORKS
 from garps_core.errors import GarpsError, InitialisationError
+from garps_core.mixture_alignment import best_alignment
 from garps_core.mixtures.reconstruct import mixtures_of, with_depth
 from garps_core.models.semantics import labelled
 from garps_core.start.initialise import initialise
@@ -25,12 +26,12 @@ from garps_core.start.initialise import initialise
 GARPS_NO_FEATURES = "garps-no-features"
 GARPS_PAPER = "garps-paper"
 VAGUE = 1e4
-"""Factor on the start's covariance that leaves it next to no say."""
+"""Factor on the start's covariance that leaves it next to no weight."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What is changed: settings, by name or from those there are; the mixtures; whether the start is believed, and is
+    """A change of GARPS: settings, by name or from those there are; the mixtures; whether the start is believed, and is
     that of GARPS as it is, although settings that it depends on are changed."""
 
     what: str
@@ -66,9 +67,10 @@ def last_rung(config: Config) -> Config:
 
 
 def as_published(config: Config) -> Config:
-    """The paper's own settings for lifting and alignment."""
-    paper = Config.preset("paper")
-    return replace(config, lifting=paper.lifting, alignment=paper.alignment)
+    """The paper's method with its own settings for lifting and alignment."""
+    published = Config.preset("paper")
+    parts = {name: getattr(published, name) for name in ("method", "lifting", "alignment", "paper")}
+    return replace(config, **parts)
 
 
 VARIANTS: dict[str, Variant] = {
@@ -79,7 +81,7 @@ VARIANTS: dict[str, Variant] = {
     "garps-no-colour": Variant(
         "neither colour nor brightness", {"alignment.colour_variance": 100.0, "alignment.brightness_measurements": 0.0}
     ),
-    "garps-no-brightness": Variant("not sharpened by brightness", {"alignment.brightness_measurements": 0.0}),
+    "garps-no-brightness": Variant("no brightness in the objective", {"alignment.brightness_measurements": 0.0}),
     "garps-equal-weights": Variant("every pixel counts the same, not the area it sees", {"lifting.weighting": "equal"}),
     "garps-no-visibility": Variant("neither visibility nor brightness", mixture=without_frustum),
     "garps-no-annealing": Variant("the finest rung only", settings=last_rung),
@@ -94,7 +96,7 @@ VARIANTS: dict[str, Variant] = {
 """By the name that stands in tables."""
 
 
-def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) -> PoseEstimate:
+def variant_estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) -> PoseEstimate:
     """The estimate of a variant from a given pose, or from whatever the settings start with. Never raises on data."""
     of_start, config = config, variant.config(config)
     if not variant.same_start:
@@ -110,7 +112,7 @@ def estimate(variant: Variant, pair: Pair, config: Config, prior: Prior | None) 
         starts = initialise(views[0], views[1], of_start, prior, NETWORKS, maps)
         if not variant.believes_start:
             starts = tuple(replace(start, covariance=VAGUE * start.covariance) for start in starts)
-        return best_of(x, y, starts, config)
+        return best_alignment(x, y, starts, config)
     except InitialisationError as error:
         return PoseEstimate(Status.NO_INITIAL_POSE, str(error), initial=prior)
     except GarpsError as error:  # an answer about this pair, not about the others

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast, how large, how repeatable: ratios taken in one run on the same inputs, against the bars set for them.
+"""Speed, memory and repeatability: ratios taken in one run on the same inputs, against their bars.
 
     python -m bench.speed [--only pairs,paper,autograd,stream,growth,determinism,memory]
 
@@ -17,20 +17,22 @@ import torch
 import typer
 from rich.console import Console
 
-from bench.pairs.datasets import DATA, Pair, available, load_pairs, scene_points
+from bench.machine.facts import machine_facts
+from bench.pairs.pair import Pair, scene_points
+from bench.pairs.readers.pairs_json import DATA, available, load_pairs
 from bench.peers import registration
-from bench.scoring.tables import machine_facts
+from bench.report.checks import Row, Section, markdown, print_section
 from bench.speed.determinism import determinism_section
 from bench.speed.growth import growth_section
 from bench.speed.memory import memory_section
 from bench.speed.pairs import pairs_section
-from bench.speed.parts import Inputs, Row, Section, imported_numba, markdown, print_section
+from bench.speed.parts import Inputs, imported_numba
 from bench.speed.solver import autograd_section, paper_section
 from bench.speed.stream import stream_section
 from garps_core import View
 
 PEER_THREADS = 2
-"""As many as GARPS may take; elsewhere peers get one, so that their poses are the same to the bit."""
+"""Threads of peers here, equal to those of GARPS; elsewhere peers get one, so that their poses repeat to the bit."""
 SECTIONS: dict[str, Callable[[Inputs], Section]] = {
     "pairs": pairs_section,
     "paper": paper_section,

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from rich.progress import track
 
+from bench.report.checks import Check, Section
 from bench.speed.fresh import arrays_of, digest, in_fresh_process
-from bench.speed.parts import Check, Inputs, Section
+from bench.speed.parts import Inputs
 from garps_core import estimate_relative_pose
 
 SAME_PROCESS, FRESH = 10, 2

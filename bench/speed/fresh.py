@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -21,11 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.machine.cost import peak_mib
 from garps_core import Config, Mixture, PoseEstimate, Prior, View, align_mixtures, estimate_relative_pose
 from garps_core.mixture import Frustum
 
 if TYPE_CHECKING:
-    from bench.pairs.datasets import Pair
+    from bench.pairs.pair import Pair
 
 Task = Callable[[], PoseEstimate]
 PARTS = ("means", "covariances", "weights", "colours")
@@ -80,22 +80,8 @@ def in_fresh_process(task: str, arrays: dict[str, Any], preset: str) -> dict[str
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
-def peak_mib() -> float:
-    """Peak resident memory of this process so far.
-
-    Linux hands the parent's peak on to a forked child's ru_maxrss; VmHWM begins anew with each program.
-    """
-    status = Path("/proc/self/status")
-    if status.is_file():
-        peaks = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
-        if peaks:
-            return round(int(peaks[0].split()[1]) / 1024, 1)
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit, 1)
-
-
 def main(task: str, path: Path, preset: str) -> None:
-    """What the fresh process does: the task twice; prints its peak memory on the way and what it found, as JSON."""
+    """Do the task twice and print peak memory and the digest as JSON."""
     memory: dict[str, Any] = {"imports": peak_mib()}
     with np.load(path) as held:
         run = _estimation(held, preset) if task == "estimate" else _alignment(held, preset)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the cost grows with the number of components and of neighbours, all components used."""
+"""Growth of the cost with the number of components and of neighbours, all components used."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import TypeVar
 import numpy as np
 from rich.progress import track
 
+from bench.report.checks import Check, Row, Section
 from bench.speed.fresh import STEPS, all_used
-from bench.speed.parts import Check, Inputs, Row, Section, lifted, threads
+from bench.speed.parts import Inputs, lifted, threads
 from garps_core import Mixture, align_mixtures
 from garps_core.config import Rung
 from garps_core.objective.pairs import pair_up, to_device
@@ -70,7 +71,7 @@ def measure(full: tuple[Mixture, Mixture], n: int, k: int, inputs: Inputs) -> Ro
     source, target = (subset(mixture, n) for mixture in full)
     config, T = all_used(inputs.config, n, k), inputs.prior.T_target_source
     x, y = (to_device(mixture, config) for mixture in (source, target))
-    rung = Rung(config.alignment.ladder[-1].covariance_scale, n, k)
+    rung = Rung(covariance_scale=config.alignment.ladder[-1].covariance_scale, components=n, neighbours=k)
     row: Row = {"components": n, "neighbours": k}
     with threads(1):
         row["pairing"], pairs = timed(lambda: pair_up(x, y, T, rung, config.alignment))

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.report.checks import Check, Row, Section
 from bench.speed.fresh import arrays_of, arrays_of_mixtures, in_fresh_process
 from bench.speed.growth import fine_mixtures, subset
-from bench.speed.parts import Check, Inputs, Row, Section
+from bench.speed.parts import Inputs
 
 COMPONENTS, NEIGHBOURS = 100_000, 20
 BAR_MIB = 1024.0

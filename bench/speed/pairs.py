@@ -7,9 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, disturbed_prior
-from bench.peers.baselines import METHODS
-from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians
+from bench.pairs.pair import Pair
+from bench.pairs.starts import disturbed_prior
+from bench.peers.methods import METHODS
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, interleaved, medians
 from garps_core import Config, PoseEstimate, Prior, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,14 +14,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bench.peers.autograd import PlainObjective
-from bench.speed.parts import Check, Inputs, Row, Section, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, interleaved, medians, threads
 from garps_core import Config, Mixture, PoseEstimate, Prior, align_mixtures, metrics
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import to_device
-from garps_core.objective.shape import Pairs, evaluate, unpack
-from garps_core.objective.state import State
+from garps_core.objective.shape import Pairs, evaluate
+from garps_core.objective.state import State, WeightedStart
 from garps_core.solver import ladder, paper
+from garps_core.solver.problem import Problem
 
 PAPER_BAR, AUTOGRAD_BAR = 40.0, 200.0
 PLAIN_STEPS = 5
@@ -32,7 +36,7 @@ SAME_STEPS = 100
 
 @dataclass(frozen=True)
 class Contest:
-    """The same components for both: only the weights are each preset's own (area seen; one per component)."""
+    """Both solvers with equal components: only the weights are each preset's own (area seen; one per component)."""
 
     mixtures: dict[str, tuple[Mixture, Mixture]]
     configs: dict[str, Config]
@@ -46,10 +50,10 @@ class Contest:
         return estimate
 
     def paper_pairs(self) -> Pairs:
-        """What the paper's solver works on. Raises RuntimeError when too little is left."""
+        """Pairs of the paper's solver. Raises RuntimeError when too few are left."""
         config = self.configs[PAPER]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[PAPER])
-        pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.alignment)
+        pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.paper)
         if pairs is None:
             raise RuntimeError("the paper's preset keeps fewer than 50 components of this pair: give a larger one")
         return pairs
@@ -57,24 +61,25 @@ class Contest:
     def same_problem(self) -> Float64Array:
         """End pose of the default solver's steps on what the paper's solver works on: its objective, its pairs."""
         pairs, start = self.paper_pairs(), State(self.prior.T_target_source)
-        known = ladder.WeightedStart(start.T, 1e-9 * np.eye(6))
+        weak = WeightedStart(start.T, 1e-9 * np.eye(6))
 
         def function(at: State) -> ladder.Posterior:
-            return ladder.posterior(evaluate(pairs, at.T, "sum"), at, known, 1.0)
+            return ladder.posterior(evaluate(pairs, at.T, "sum"), at, weak, 1.0)
 
         return ladder.ascend(function, start, SAME_STEPS, 1e-3).at.T
 
     def published(self) -> Float64Array:
         """End pose of the paper's steps on the same, pairs chosen anew as above."""
-        settings = self.configs[PAPER].alignment
-        steps = settings.ladder[0].steps
-        return paper.adam_path(self.paper_pairs(), self.prior.T_target_source, settings, steps)[-1]
+        settings = self.configs[PAPER].paper
+        return paper.adam_path(self.paper_pairs(), self.prior.T_target_source, settings, settings.steps)[-1]
 
     def rung_pairs(self, rung: Rung, T: Float64Array) -> tuple[Pairs, Pairs]:
-        """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
+        """Pairs of the default solver at pose T in one rung. Raises RuntimeError when too few are left."""
         config = self.configs[DEFAULT]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[DEFAULT])
-        pairs = ladder.rung_pairs(source, target, T, rung, config.alignment, config.alignment.partner_density)
+        with ThreadPoolExecutor(1) as pool:
+            problem = Problem(source, target, WeightedStart(T, np.eye(6)), config, pool)
+            pairs = ladder.rung_pairs(problem, T, rung, config.alignment.partner_density)
         if pairs is None:
             raise RuntimeError("fewer than 50 components are seen by both views: give another pair")
         return pairs
@@ -84,7 +89,7 @@ def contest(inputs: Inputs, steps: int | None = None) -> Contest:
     """Both solvers on the first pair; `steps` of Adam instead of the published 1000 (for a quick test)."""
     published = Config.preset("paper")
     if steps is not None:
-        published = published.replace({"alignment.ladder": (replace(published.alignment.ladder[0], steps=steps),)})
+        published = published.replace({"paper.steps": steps})
     lifted = inputs.mixtures
     equal = tuple(replace(mixture, weights=np.ones_like(mixture.weights)) for mixture in lifted)
     mixtures = {DEFAULT: lifted, PAPER: (equal[0], equal[1])}
@@ -125,10 +130,14 @@ def objectives(held: Contest, ends: dict[str, PoseEstimate]) -> dict[str, tuple[
     """
     one_way = held.paper_pairs()
     both_ways = held.rung_pairs(held.configs[DEFAULT].alignment.ladder[-1], pose_of(ends[DEFAULT]))
-    return {
-        name: (evaluate(one_way, pose_of(end), "sum").value, ladder.two_way(*both_ways, State(pose_of(end))).value)
-        for name, end in ends.items()
-    }
+    with ThreadPoolExecutor(1) as pool:
+        return {
+            name: (
+                evaluate(one_way, pose_of(end), "sum").value,
+                ladder.two_way(*both_ways, State(pose_of(end)), pool).value,
+            )
+            for name, end in ends.items()
+        }
 
 
 def pose_of(end: PoseEstimate) -> Float64Array:
@@ -161,7 +170,7 @@ def _sizes(held: Contest, ends: dict[str, PoseEstimate]) -> list[str]:
 def autograd_section(inputs: Inputs, steps: int | None = None) -> Section:
     """The default solver against the plain script, which gets the number of threads that serves it best."""
     held = contest(inputs, steps)
-    wanted = held.configs[PAPER].alignment.ladder[0].steps
+    wanted = held.configs[PAPER].paper.steps
     objective = plain(held.paper_pairs())
     q, t = start_of(held.prior, objective.means.dtype)
 
@@ -186,7 +195,7 @@ def autograd_section(inputs: Inputs, steps: int | None = None) -> Section:
 
 
 def plain(pairs: Pairs) -> PlainObjective:
-    """The same candidate pairs, gathered one by one, for the reference."""
+    """Candidate pairs gathered one by one, for the reference."""
     k, n = pairs.log_weights.shape
     weights = (pairs.log_weights.exp() * pairs.weights).reshape(k * n)
     kept = weights > 0

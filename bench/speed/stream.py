@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 from torch import Tensor
 
-from bench.speed.parts import Check, Inputs, Row, Section, imported_numba, interleaved, medians, threads
+from bench.report.checks import Check, Row, Section
+from bench.speed.parts import Inputs, imported_numba, interleaved, medians, threads
 from garps_core import Config, Mixture
 from garps_core.checks import Float64Array
 from garps_core.config import Rung
@@ -52,7 +53,8 @@ def exact_pairs(mixtures: tuple[Mixture, Mixture], T: Float64Array, n: int, k: i
     if len(rows) < n:
         raise ValueError(f"the mixture has {len(rows)} components, {n} rows are wanted: give larger images")
     scale = config.alignment.ladder[-1].covariance_scale
-    return pair_up(thin(rows, n), partners, T, Rung(scale, n, k), config.alignment)
+    rung = Rung(covariance_scale=scale, components=n, neighbours=k)
+    return pair_up(thin(rows, n), partners, T, rung, config.alignment)
 
 
 def _planes(pairs: Pairs) -> list[Tensor]:

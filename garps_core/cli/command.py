@@ -14,7 +14,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from garps_core import __version__
-from garps_core.align import NETWORKS, align_mixtures, estimate_with_mixtures
+from garps_core.align import Estimator, align_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.cli.image_files import read_image, read_view
 from garps_core.cli.report import as_json, as_text
@@ -22,7 +22,7 @@ from garps_core.cli.weights import app as weights_app
 from garps_core.config import PRESETS, Config, Reconstruction, methods
 from garps_core.config.combinations import check_settings
 from garps_core.config.start import STARTS, TWO_VIEW
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.mixtures.splat_reader import read_splats
@@ -37,10 +37,11 @@ ClickException: type[Exception] = typer.BadParameter.__mro__[2]
 
 Four = tuple[float, float, float, float]
 Settings = Annotated[
-    Path | None, typer.Option(help="YAML file of settings, as for the node; before --set.", metavar="FILE")
+    Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", help="Change a setting; repeat at will.", metavar="NAME=VALUE")
+    list[str] | None,
+    typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
 ]
 app = typer.Typer(
     help="Metric relative pose of two cameras by aligning two 3D Gaussian mixtures.",
@@ -133,10 +134,10 @@ def align(
     """
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
-    options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    method = _configured(Config(), settings, set_, options).reconstruction.method
-    base = Config.preset(preset or preset_for(method, splats or any(depths)))
-    config = _configured(base, settings, set_, options)
+    changes = _changes(set_, {"device": device, "reconstruction.method": reconstruction, "start.method": start})
+    with_depth = splats or any(depths)
+    config = configured(preset, settings, changes, lambda asked: preset_for(asked.reconstruction.method, with_depth))
+    checked_device(config.device)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -193,13 +194,14 @@ def _of_images(
     config: Config,
     given: Prior | None,
 ) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
+    estimator = Estimator(config)
     try:
-        source, target, maps = _views(files, depths, Ks, scale, config)
+        source, target, maps = _views(files, depths, Ks, scale, estimator)
     except WeightsError:
         raise
     except (InitialisationError, ModelError) as failure:  # only a network that estimates intrinsics raises them
         return PoseEstimate(Status.NO_INITIAL_POSE, f"no --K, and none by {config.start.method}: {failure}"), None
-    return estimate_with_mixtures(source, target, config, given, maps)
+    return estimator.estimate_with_mixtures(source, target, given, maps)
 
 
 def _views(
@@ -207,19 +209,20 @@ def _views(
     depths: tuple[Path | None, Path | None],
     Ks: tuple[Four | None, Four | None],
     scale: Any,
-    config: Config,
+    estimator: Estimator,
 ) -> tuple[View, View, PairMaps | None]:
     if Ks[0] is None and Ks[1] is not None:
         raise InputError("--K-target is given without --K: expected both, --K alone if they are equal, or none")
     if Ks[0] is None:
-        return _uncalibrated(files, depths, scale, config)
+        return _uncalibrated(files, depths, scale, estimator)
     of_source, of_target = _intrinsics("--K", Ks[0]), _intrinsics("--K-target", Ks[1] or Ks[0])
     return read_view(files[0], of_source, depths[0], scale), read_view(files[1], of_target, depths[1], scale), None
 
 
 def _uncalibrated(
-    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], scale: Any, config: Config
+    files: tuple[Path, Path], depths: tuple[Path | None, Path | None], scale: Any, estimator: Estimator
 ) -> tuple[View, View, PairMaps]:
+    config = estimator.config
     if config.start.method not in TWO_VIEW:
         raise InputError(
             "--K is missing: expected FX FY CX CY in pixels, from the camera's calibration; or a two-view network that "
@@ -228,17 +231,15 @@ def _uncalibrated(
     if config.reconstruction.method == "two_view":
         check_settings(config)
     images = [read_image(file) for file in files]
-    maps = NETWORKS.pair_maps(images[0], images[1], config)
+    maps = estimator.networks.pair_maps(images[0], images[1], config)
     Ks = intrinsics_of(maps, (images[0].shape[:2], images[1].shape[:2]), config.start.min_confidence)
     source, target = (read_view(*given, scale, K_estimated=True) for given in zip(files, Ks, depths, strict=True))
     return source, target, maps
 
 
-def _configured(base: Config, file: Path | None, changes: list[str] | None, options: dict[str, str | None]) -> Config:
-    given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(base if file is None else read_settings(file, base), changes or []).replace(given)
-    checked_device(config.device)
-    return config
+def _changes(given: list[str] | None, options: dict[str, str | None]) -> list[str]:
+    """Return NAME=VALUE of --set, then of options that stand for a setting."""
+    return [*(given or []), *(f"{name}={value}" for name, value in options.items() if value is not None)]
 
 
 def _intrinsics(option: str, values: Four) -> Float64Array:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Before/after picture of an alignment: source in yellow, target in blue, green where their surfaces coincide.
 
-The only file that imports matplotlib, and only when a picture is drawn. The points are splatted with numpy: 3D
-scatter plots sort whole artists, not points, and hide what the picture is about.
+No other file imports matplotlib, and this one only when it draws. The points are splatted with numpy, because 3D
+scatter plots sort whole artists instead of points, and so hide points that should be visible.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ YELLOW = np.array([242, 178, 0]) / 255
 BLUE = np.array([38, 92, 214]) / 255
 GREEN = np.array([38, 160, 84]) / 255
 PANEL = (900, 640)
-"""Width and height of a rendered view, pixels."""
+"""Width and height of a rendered view, px."""
 
 LABEL: dict[str, Any] = {"fontsize": 11, "ha": "right", "bbox": {"facecolor": "white", "edgecolor": "0.7", "pad": 4}}
 
@@ -36,9 +36,9 @@ class Eye:
     """A virtual pinhole camera.
 
     Args:
-        T_eye_target: 4x4, target camera points into the eye.
-        focal: pixels.
-        centre: principal point, x and y in pixels of the panel.
+        T_eye_target: 4x4, maps points of the target camera into the eye, m.
+        focal: focal length, px.
+        centre: principal point x and y in the panel, px.
     """
 
     T_eye_target: Array
@@ -49,17 +49,17 @@ class Eye:
 def before_after(
     source: Mixture, target: Mixture, T_before: Any, T_after: Any, path: str | Path, title: str = ""
 ) -> Path:
-    """Draw source and target under two poses, side by side: a look from behind the target camera, and from above.
+    """Draw source and target under two poses, side by side, seen from behind the target camera and from above.
 
     Args:
         source, target: mixtures in the frames of their cameras.
         T_before, T_after: 4x4 T_target_source, metres.
-        path: .png (or what matplotlib can write).
+        path: a .png file, or another format that matplotlib writes.
         title: one line above the panels.
     Returns:
         The path.
     Raises:
-        InputError: matplotlib missing, an empty mixture, no rigid motions, or a file that cannot be written.
+        InputError: matplotlib is missing, a mixture is empty, a pose is no rigid motion, or the file cannot be written.
     """
     poses = [checked_rigid("T_before", T_before), checked_rigid("T_after", T_after)]
     if not len(source) or not len(target):
@@ -69,7 +69,7 @@ def before_after(
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
-        raise InputError("pictures need matplotlib: pip install matplotlib") from None
+        raise InputError("pictures need matplotlib, which is not installed. Run: pip install matplotlib") from None
     figure = Figure(figsize=(12.4, 9.6), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     _compose(figure, panels, poses, title)
@@ -85,7 +85,7 @@ class _Panels:
     oblique: list[tuple[Image, float]]
     above: list[Image]
     extent: tuple[float, float, float, float]
-    """left, right, bottom, top of the plan view: x and z of the target camera, m."""
+    """Left, right, bottom and top of the plan view: x and z of the target camera, m."""
 
 
 def _panels(source: Mixture, target: Mixture, poses: list[Array]) -> _Panels:
@@ -100,14 +100,14 @@ def _panels(source: Mixture, target: Mixture, poses: list[Array]) -> _Panels:
 
 
 def _shade(mixture: Mixture) -> Array:
-    """Brightness 0.45..1 per component, so that the room stays recognisable under one tint."""
+    """Return a brightness of 0.45..1 per component, so that the room stays recognisable under one tint."""
     grey = np.asarray(mixture.colours, float) @ (0.299, 0.587, 0.114)
     low, high = np.percentile(grey, (2, 98))
     return np.asarray(0.45 + 0.55 * np.clip((grey - low) / max(high - low, 1e-3), 0, 1))
 
 
 def _viewpoint(target: Array, placed: list[Array]) -> Eye:
-    """Behind, above and to the right of the target camera, looking at the middle of what it sees."""
+    """Return an eye behind, above and to the right of the target camera, which looks at the middle of its points."""
     centre = np.median(target, axis=0)
     reach = float(np.linalg.norm(centre))
     position = np.array([0.35, -0.5, -0.3]) * reach
@@ -125,9 +125,10 @@ def _viewpoint(target: Array, placed: list[Array]) -> Eye:
 
 
 def _oblique(eye: Eye, clouds: list[Array], shades: list[Array]) -> tuple[Image, float]:
-    """Both clouds through one eye: the nearer one wins, green where the two agree to 1.5 % of the range.
+    """Render both clouds through one eye: the nearer point wins, green where the two agree to 1.5 % of the range.
 
-    Also the share of the pixels that both cover where they agree.
+    Returns:
+        The image (height, width, 3), and the share of the pixels covered by both in which they agree.
     """
     (depth_s, shade_s), (depth_t, shade_t) = (
         _splat(eye, cloud, shade) for cloud, shade in zip(clouds, shades, strict=True)
@@ -144,14 +145,14 @@ def _oblique(eye: Eye, clouds: list[Array], shades: list[Array]) -> tuple[Image,
 
 
 def _splat(eye: Eye, points: Array, shade: Array, radius: int = 2) -> tuple[Image, Image]:
-    """Square splats with a depth test: depth (inf = nothing) and brightness, each PANEL height x width."""
+    """Draw square splats with a depth test. Returns depth (inf = nothing) and brightness, each PANEL height x width."""
     width, height = PANEL
     seen = transform(eye.T_eye_target, points)
     keep = seen[:, 2] > 0.05 * np.median(np.abs(seen[:, 2]))
     seen, shade = seen[keep], shade[keep]
     columns = np.rint(eye.focal * seen[:, 0] / seen[:, 2] + eye.centre[0]).astype(int)
     rows = np.rint(eye.focal * seen[:, 1] / seen[:, 2] + eye.centre[1]).astype(int)
-    order = np.argsort(-seen[:, 2], kind="stable")  # far first: what is written last stays
+    order = np.argsort(-seen[:, 2], kind="stable")  # far first: the last one written stays
     depth, bright = np.full((height, width), np.inf), np.zeros((height, width))
     offsets = [(dr, dc) for dr in range(-radius, radius + 1) for dc in range(-radius, radius + 1)]
     for dr, dc in sorted(offsets, key=lambda o: -(o[0] ** 2 + o[1] ** 2)):
@@ -166,7 +167,7 @@ def _splat(eye: Eye, points: Array, shade: Array, radius: int = 2) -> tuple[Imag
 
 
 def _plan_extent(clouds: list[Array], poses: list[Array]) -> tuple[float, float, float, float]:
-    """Bounds of the plan view with the shape of a panel: all cameras and nearly all points."""
+    """Return bounds of the plan view, m, in the shape of a panel: they hold all cameras and nearly all points."""
     low, high = np.percentile(np.concatenate(clouds)[:, [0, 2]], (3, 97), axis=0)
     cameras = np.array([[0.0, 0.0], *(T[[0, 2], 3] for T in poses)])
     low, high = np.minimum(low, cameras.min(0)) - 0.15, np.maximum(high, cameras.max(0)) + 0.15
@@ -181,7 +182,7 @@ def _plan_extent(clouds: list[Array], poses: list[Array]) -> tuple[float, float,
 
 
 def _plan(clouds: list[Array], extent: tuple[float, float, float, float]) -> Image:
-    """Seen from above as ink: upright surfaces are the dark lines, green where both clouds left some."""
+    """Draw the view from above as ink: upright surfaces become dark lines, green where both clouds leave ink."""
     width, height = PANEL[0] // 3, PANEL[1] // 3
     amounts = []
     for points in clouds:
@@ -228,7 +229,7 @@ def _motion(T: Array) -> str:
 
 
 def _draw_camera(axes: Any, T: Array, colour: Array, extent: tuple[float, float, float, float]) -> None:
-    """A wedge with its tip at the camera's centre, opening where it looks; plan view."""
+    """Draw a wedge in the plan view, with its tip at the camera's centre, open in the direction of view."""
     size = 0.06 * (extent[3] - extent[2])
     wedge = transform(T, np.array([[0.0, 0, 0], [-0.6, 0, 1], [0.6, 0, 1], [0.0, 0, 0]]) * size)
     axes.fill(wedge[:, 0], wedge[:, 2], facecolor=colour, edgecolor="black", linewidth=0.8, zorder=5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image and depth files -> View. The one place of the core that reads files."""
+"""Image and depth files -> View. Pictures are read only here in the core."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ def read_view(
     """Read a colour image and, when given, its registered depth.
 
     Args:
-        image: what OpenCV decodes to colour (PNG, JPEG, ...). EXIF rotation is ignored: K belongs to the stored pixels.
-        K: 3x3 pixels.
+        image: a file that OpenCV decodes to colour (PNG, JPEG, ...). EXIF rotation is ignored: K belongs to the stored
+            pixels.
+        K: 3x3, px.
         depth: see `read_depth`.
         depth_scale: metres per unit of the depth file; None = 0.001 for integers, 1 for floats.
         K_estimated: K is a network's estimate.
     Raises:
-        InputError: a file that is missing, no image, or does not fit the other; names the file.
+        InputError: a file is missing, is no image, or does not fit the other; the text names the file.
     """
     rgb = read_image(image)
     metres = None if depth is None else read_depth(depth, depth_scale)
@@ -44,13 +45,22 @@ def read_view(
 
 
 def read_image(path: Path) -> npt.NDArray[np.uint8]:
-    """HxWx3 uint8, red first."""
+    """Read an image file. Returns HxWx3 uint8, red first; raises InputError."""
     bgr = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, "a colour image (PNG, JPEG, ...)")
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
 
 
 def read_depth(path: Path, scale: float | None = None) -> Float32Array:
-    """HxW float32 metres, NaN = no reading, from a 16-bit PNG or TIFF, a float TIFF, or a .npy file."""
+    """Read depth from a 16-bit PNG or TIFF, a float TIFF, or a .npy file.
+
+    Args:
+        path: the file.
+        scale: metres per unit; None = 0.001 for integers, 1 for floats.
+    Returns:
+        HxW float32 metres, NaN = no reading.
+    Raises:
+        InputError: the file cannot be read or decoded, or has the wrong shape, type or scale.
+    """
     raw = _loaded_npy(path) if path.suffix.lower() == ".npy" else _decoded(path, cv2.IMREAD_UNCHANGED, "a depth image")
     if raw.ndim != 2 or raw.dtype.kind not in "uif" or raw.dtype.itemsize == 1:
         raise InputError(
@@ -93,4 +103,6 @@ def _loaded_npy(path: Path) -> npt.NDArray[Any]:
 
 def _check_size(path: Path, shape: tuple[int, ...]) -> None:
     if len(shape) >= 2 and shape[0] * shape[1] > MAX_IMAGE_PIXELS:
-        raise InputError(f"{path} is {shape[1]}x{shape[0]}: expected at most {MAX_IMAGE_PIXELS} pixels; resize it")
+        raise InputError(
+            f"{path} is {shape[1]}x{shape[0]}: expected at most {MAX_IMAGE_PIXELS} pixels. Resize the image."
+        )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A PoseEstimate for machines (JSON types) and for people (text)."""
+"""PoseEstimate -> JSON types for machines, and text for people."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from garps_core.types import PoseEstimate
 
 
 def as_json(estimate: PoseEstimate) -> dict[str, Any]:
-    """Everything in a PoseEstimate as JSON types; a pose that is not there is null."""
+    """Return everything in a PoseEstimate as JSON types; a missing pose is null."""
     initial = estimate.initial
     return {
         "status": estimate.status.value,
@@ -52,7 +52,7 @@ def _quaternion(T: Float64Array) -> Float64Array:
 
 
 def as_text(estimate: PoseEstimate) -> str:
-    """A summary for people."""
+    """Return a summary of several lines for people."""
     lines = [f"status       {estimate.status.value}" + (f": {estimate.reason}" if estimate.reason else "")]
     T, covariance = estimate.T_target_source, estimate.covariance
     if T is None:

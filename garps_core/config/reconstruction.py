@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of the reconstruction, the part of `Config` that says whose depth a mixture is made of."""
+"""The settings of the reconstruction: whose depth a mixture is made of, and which weights networks use."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ DEPTH_NETWORKS = {
 DEPTH_PLUGINS = "garps_core.depth"
 """Entry point group of the depth networks that other distributions add (docs/extending.md)."""
 SCENES = ("any", "indoor", "outdoor")
+"""Kinds of scene that weights of a depth network are made for."""
 _BEFORE, _AFTER = ("auto", "rgbd"), ("flash3d", "two_view", "ply")
 
 
@@ -49,38 +50,60 @@ def _installed(path: tuple[str, ...]) -> dict[str, EntryPoint]:
 
 @dataclass(frozen=True)
 class Reconstruction(Checked):
-    """What turns a view into a mixture (`reconstruct`), and which weights it uses (`docs/weights.md`)."""
+    """How `reconstruct` turns a view into a mixture, and which weights it uses (docs/weights.md)."""
 
     method: str = setting(
         "auto",
-        "rgbd = the sensor's depth; a network; demo_net = the one in the package, a demonstration; two_view = that of "
-        "start.method, which then runs once for both; ply = mixtures from files; auto = depth_anything_v2 without a "
-        "sensor",
+        "source of the depth: rgbd = the sensor; two_view = the network of `start.method`, asked once for both views; "
+        "ply = mixtures from files; demo_net = the demonstration network in the package; auto = the sensor, or "
+        "depth_anything_v2 for views without depth; else the network of that name",
         choices=methods,
         live=False,
     )
     depth_weights: str = setting(
-        "", "of the depth network: a name or a file; empty = the first that is installed", live=False
+        "", "weights of the depth network: name or file; empty = the first installed", live=False
     )
-    flash3d_weights: str = setting("", "of Flash3D, likewise", live=False)
+    flash3d_weights: str = setting(
+        "", "weights of Flash3D: name or file; empty = the first installed", live=False, expert=True
+    )
     scene: str = setting(
-        "any", "what depth_weights must be made for; told here where the file does not", choices=SCENES, live=False
-    )
-    depth_scale: float = setting(1.0, "factor on the network's depth", unit="", low=1e-3, high=1e3)
-    focal_correction: bool = setting(
-        False, "network's depth times the focal length over that of its training, both over the image's width"
-    )
-    drop_border: bool = setting(False, "leave out the Gaussians that Flash3D sets around the picture")
-    semantics: str = setting(
-        "none",
-        "labels by DINOv2 (linear, ms) or Mask2Former; none = `alignment.semantic_discount` has no effect",
-        choices=("none", "linear", "ms", "m2f"),
+        "any",
+        "kind of scene that the depth network's weights must be made for; a file that names none counts as this",
+        choices=SCENES,
         live=False,
     )
-    semantic_weights: str = setting(
-        "", "of the head, or of all of m2f: a name or a file; empty = the first installed", live=False
+    depth_scale: float = setting(1.0, "factor on the depth of the depth network", low=1e-3, high=1e3)
+    focal_correction: bool = setting(
+        False,
+        "multiply the network's depth by the focal length over that of its training, both relative to the image width",
+        expert=True,
     )
-    semantic_backbone: str = setting("", "weights of DINOv2 for linear and ms, likewise", live=False)
+    drop_border: bool = setting(
+        False, "leave out the Gaussians that Flash3D puts around the image, outside its border", expert=True
+    )
+    semantics: str = setting(
+        "none",
+        "source of semantic labels: linear, ms = heads on DINOv2; m2f = Mask2Former; none = no labels, so that "
+        "`alignment.semantic_discount` has no effect",
+        choices=("none", "linear", "ms", "m2f"),
+        live=False,
+        expert=True,
+    )
+    semantic_weights: str = setting(
+        "",
+        "weights of the semantic head, or of all of Mask2Former: name or file; empty = the first installed",
+        live=False,
+        expert=True,
+    )
+    semantic_backbone: str = setting(
+        "",
+        "weights of DINOv2 below the heads linear and ms: name or file; empty = the first installed",
+        live=False,
+        expert=True,
+    )
     network_dtype: str = setting(
-        "float32", "what networks compute in; the other two for GPUs", choices=("float32", "float16", "bfloat16")
+        "float32",
+        "arithmetic of the networks; float16 and bfloat16 are for GPUs",
+        choices=("float32", "float16", "bfloat16"),
+        expert=True,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of the start, the part of `Config` that says where the alignment begins."""
+"""The settings of the start: the pose that an alignment begins from."""
 
 from __future__ import annotations
 
@@ -10,48 +10,80 @@ from garps_core.config.field import Checked, setting
 TWO_VIEW = ("mast3r", "dust3r", "adapter")
 """Starts by a two-view network."""
 STARTS = ("auto", "features", "identity", *TWO_VIEW)
+"""Ways to a start pose."""
 
 
 @dataclass(frozen=True)
 class Start(Checked):
-    """Where the alignment starts (`initialise`)."""
+    """How `initialise` finds the start pose."""
 
     method: str = setting(
         "auto",
-        "auto = the given prior and features together, or the one there is, else identity when `identity_fallback`; "
-        "mast3r, dust3r, adapter = a two-view network, and the prior",
+        "source of the start pose: auto = the given prior and features together, or the one there is, else identity if "
+        "`start.identity_fallback`; features; identity; mast3r, dust3r, adapter = a two-view network, and the prior",
         choices=STARTS,
         live=False,
     )
     weights: str = setting(
-        "", "of mast3r, dust3r or the adapter: a name or a file; empty = the first installed", live=False
+        "",
+        "weights of the two-view network of `start.method`: name or file; empty = the first installed",
+        live=False,
     )
-    adapter: str = setting("", "name of an installed two-view adapter (docs/two_view_models.md)", live=False)
+    adapter: str = setting(
+        "", "name of an installed two-view adapter (docs/two_view_models.md); empty = none", live=False
+    )
     pose_from: str = setting(
-        "maps", "a two-view network's point maps, or matches of its descriptors", choices=("maps", "matches")
+        "maps",
+        "part of a two-view network's answer that gives the pose: maps = point maps, matches = matched descriptors",
+        choices=("maps", "matches"),
+        expert=True,
     )
     scale: str = setting(
         "auto",
-        "whose metres a two-view network's pose gets: its own, or the depth's; auto = its own if it has any",
+        "source of the metres of a two-view network's pose: network; depth = the views' depth; auto = the network if "
+        "it is metric, else the depth",
         choices=("auto", "network", "depth"),
+        expert=True,
     )
     min_confidence: float = setting(
-        3.0, "points of which a two-view network is less sure are not used", unit="", low=0, high=1e6
+        3.0, "smallest confidence of a two-view network's points that are used", low=0, high=1e6, expert=True
     )
-    network_scale_sigma: float = setting(0.1, "relative error of a two-view network's metre", low=0, high=1)
-    network_warp_sigma: float = setting(0.02, "relative smooth warp of a two-view network's points", low=0, high=1)
-    focal_sigma: float = setting(0.05, "relative error of a focal length that a network has estimated", low=0, high=1)
-    features: bool = setting(True, "match features also where a prior is given: they check and fit_brightness it")
+    network_scale_sigma: float = setting(
+        0.1, "sigma of the relative scale error of a two-view network's metres", low=0, high=1, expert=True
+    )
+    network_warp_sigma: float = setting(
+        0.02, "sigma of each relative smooth warp of a two-view network's points", low=0, high=1, expert=True
+    )
+    focal_sigma: float = setting(
+        0.05, "sigma of the relative error of a focal length that a network has estimated", low=0, high=1, expert=True
+    )
+    features: bool = setting(True, "match features also where a prior is given; they check it and make it more precise")
     max_contradiction: float = setting(
-        5.0, "given prior and features further apart than this are two rivals", unit="sigma", low=1, high=1e6
+        5.0,
+        "largest distance between the given prior and the pose of the features; beyond it both are aligned and the "
+        "better result wins",
+        unit="sigma",
+        low=1,
+        high=1e6,
+        expert=True,
     )
-    max_features: int = setting(2000, "SIFT features per image", low=50, high=20000)
-    match_ratio: float = setting(0.8, "ratio test of the feature matches", unit="", low=0.1, high=1)
-    ransac_px: float = setting(3.0, "inlier threshold of the pose estimate", unit="px", low=0.1, high=50)
-    min_inliers: int = setting(8, "fewer inliers than this is no pose", low=4, high=10000)
+    max_features: int = setting(2000, "largest number of SIFT features per image", low=50, high=20000)
+    match_ratio: float = setting(
+        0.8, "largest ratio of the distances to the best and the second-best match", low=0.1, high=1, expert=True
+    )
+    ransac_px: float = setting(
+        3.0, "largest reprojection error of an inlier of the feature pose", unit="px", low=0.1, high=50, expert=True
+    )
+    min_inliers: int = setting(
+        8, "smallest number of inliers of a pose from features or matches", low=4, high=10000, expert=True
+    )
     covariance_inflation: float = setting(
-        2.5, "sigmas of the feature pose are multiplied by this (calibrated)", unit="", low=0.1, high=100
+        2.5, "factor on the sigmas of the feature pose (calibrated)", low=0.1, high=100, expert=True
     )
-    identity_fallback: bool = setting(True, "start from identity when features fail and no prior is given")
-    identity_sigma_m: float = setting(0.3, "sigma of the identity start, translation", unit="m", low=1e-4, high=100)
-    identity_sigma_rad: float = setting(0.2, "sigma of the identity start, rotation", unit="rad", low=1e-4, high=3)
+    identity_fallback: bool = setting(True, "start from the identity where no prior is given and features give no pose")
+    identity_sigma_m: float = setting(
+        0.3, "sigma of the translation of an identity start", unit="m", low=1e-4, high=100, expert=True
+    )
+    identity_sigma_rad: float = setting(
+        0.2, "sigma of the rotation of an identity start", unit="rad", low=1e-4, high=3, expert=True
+    )

@@ -11,18 +11,16 @@ map gets wrong is not in the components; the alignment knows of it (`depth_error
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
+from garps_core.edges import away_from_edges
 from garps_core.errors import MissingDepthError, ReconstructionError
 from garps_core.mixtures.frustum import MIN_COMPONENTS, frustum_of, in_range, z_order
 from garps_core.types import Mixture, View
-
-Bool = npt.NDArray[np.bool_]
 
 
 def lift(view: View, lifting: Lifting) -> Mixture:
@@ -87,17 +85,8 @@ def _sampled(depth: Float32Array, lifting: Lifting) -> tuple[npt.NDArray[np.intp
     """Rows and columns, on the sampling grid, of usable pixels in Z-order."""
     s = lifting.stride
     rows, columns = z_order(*depth[s // 2 :: s, s // 2 :: s].shape)
-    good = (_smooth_surface(depth, lifting) & np.isfinite(depth))[s // 2 :: s, s // 2 :: s][rows, columns]
+    good = away_from_edges(depth, 2 * lifting.edge_ratio)[s // 2 :: s, s // 2 :: s][rows, columns]
     return rows[good], columns[good]
-
-
-def _smooth_surface(depth: Float32Array, lifting: Lifting) -> Bool:
-    """True where no 3x3 neighbour lies on another surface: depth edges hold readings of neither side."""
-    filled = np.where(np.isfinite(depth), depth, np.float32(0))
-    kernel = np.ones((3, 3), np.uint8)
-    far = cv2.dilate(filled, kernel)
-    near = cv2.erode(np.where(filled > 0, filled, np.float32(1e6)), kernel)
-    return np.asarray(far - near < lifting.edge_ratio * 2 * near, bool)
 
 
 def _lift(

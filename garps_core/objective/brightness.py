@@ -21,11 +21,14 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from garps_core.checks import Float32Array
 from garps_core.depth_errors import error_fields
+from garps_core.edges import GRID_EDGE_RATIO, away_from_edges
 from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
 from garps_core.mixture import Frustum
+from garps_core.objective.visibility import SAME_SURFACE_RATIO, surface_at
 
 GRIDS = (8, 4, 2, 1)
 """Every n-th cell of the frustum's grid, coarse to fine: a basin of some pixels of the first."""
@@ -33,10 +36,8 @@ STEPS = 6
 MAX_POINTS = 6000
 """Points per direction, those with the strongest gradients."""
 MIN_POINTS = 100
-EDGE_RATIO = 0.12
-"""Points whose neighbours' depths differ by more than this share may belong to either side of an edge."""
-HIDDEN_RATIO = 0.15
-"""Points whose depth differs by more than this share from what the other camera sees there are not the same surface."""
+NEAREST_M = 0.05
+"""Points nearer to the other camera than this are left out, m: their pixels move too fast to be followed."""
 MIN_CONTRAST = 0.02
 """Standard deviation of the brightness (of 0..1) below which there is nothing to compare."""
 TUKEY = 4.0
@@ -157,25 +158,18 @@ def grid_of(view: Frustum, step: int) -> Grid:
     assert view.brightness is not None  # noqa: S101 - `fit_brightness` has looked
     image = view.brightness if step == 1 else cv2.GaussianBlur(view.brightness, (0, 0), 0.5 * step)
     image = np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step], np.float32)
-    depth = view.depth[step // 2 :: step, step // 2 :: step]
+    depth = np.ascontiguousarray(view.depth[step // 2 :: step, step // 2 :: step])
     K = view.K.copy()
     K[:2] /= step
     K[:2, 2] -= (step // 2) / step
     slope_x, slope_y = (cv2.Scharr(image, cv2.CV_32F, dx, 1 - dx) / np.float32(32) for dx in (1, 0))
-    v, u = np.nonzero(_on_one_surface(depth))
+    v, u = np.nonzero(away_from_edges(depth, GRID_EDGE_RATIO))
     strength = np.hypot(slope_x, slope_y)[v, u]
     if len(u) > MAX_POINTS:
         strongest = np.sort(np.argpartition(-strength, MAX_POINTS)[:MAX_POINTS])
         u, v = u[strongest], v[strongest]
     points = pixel_rays(K, u.astype(float), v.astype(float)) * depth[v, u].astype(float)[:, None]
     return Grid(image, slope_x, slope_y, depth, K, points, image[v, u].astype(float), view.patch_sigma)
-
-
-def _on_one_surface(depth: Float32Array) -> npt.NDArray[np.bool_]:
-    there, kernel = np.isfinite(depth), np.ones((3, 3), np.uint8)
-    far = cv2.dilate(np.where(there, depth, np.float32(0)), kernel)
-    near = cv2.erode(np.where(there, depth, np.float32(1e6)), kernel)
-    return np.asarray(there & (far - near < EDGE_RATIO * near))
 
 
 def both_ways(x: Grid, y: Grid, T: Array) -> tuple[Comparison, Comparison] | None:
@@ -194,7 +188,7 @@ def summed(f: Comparison, b: Comparison, T: Array) -> tuple[Array, Array]:
 def _overlaid(x: Grid, y: Grid, T: Array) -> _Overlay | None:
     """Points of x on the pixels of y that they fall on; None when too few do, or all look alike."""
     moved = x.points @ T[:3, :3].T + T[:3, 3]
-    pixel = _seen_at(moved, y)
+    pixel = _pixels_of(moved, y)
     inside = np.isfinite(pixel[:, 0])
     if inside.sum() < MIN_POINTS:
         return None
@@ -226,17 +220,14 @@ def _compared(x: Grid, y: Grid, T: Array) -> Comparison | None:
     return Comparison(JW @ J, -JW @ error, of_depth, seen.correlation, seen.share)
 
 
-def _seen_at(moved: Array, y: Grid) -> Array:
-    """Pixels (n, 2) of y on which points (n, 3) fall; NaN outside, and where y's camera sees another surface."""
-    height, width = y.image.shape
-    z = np.maximum(moved[:, 2], 1e-3)
-    u, v = (moved[:, axis] / z * y.K[axis, axis] + y.K[axis, 2] for axis in (0, 1))
-    inside = (moved[:, 2] > 0.05) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
-    surface = np.full(len(z), np.nan)
-    surface[inside] = y.depth[np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)]
-    with np.errstate(invalid="ignore"):
-        inside &= ~(np.abs(z - surface) > HIDDEN_RATIO * surface)  # kept where the depth is unknown
-    return np.where(inside[:, None], np.stack([u, v], axis=1), np.nan)
+def _pixels_of(moved: Array, y: Grid) -> Array:
+    """Pixels (n, 2) of y on which points (n, 3) m fall; NaN near or beyond the border, and on another surface."""
+    points, (height, width) = torch.from_numpy(moved), y.image.shape
+    pixel, inside, surface = surface_at(points, torch.from_numpy(y.K), torch.from_numpy(y.depth))
+    (u, v), z, surface = pixel.T, points[:, 2], surface.double()
+    inside &= (z > NEAREST_M) & (u > 1) & (v > 1) & (u < width - 2) & (v < height - 2)
+    inside &= ~((z - surface).abs() > SAME_SURFACE_RATIO * surface)  # kept where the depth is unknown
+    return np.where(inside.numpy()[:, None], pixel.numpy(), np.nan)
 
 
 def _sampled(image: Float32Array, u: Array, v: Array) -> Array:

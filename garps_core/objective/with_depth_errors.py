@@ -22,8 +22,9 @@ from torch import Tensor
 
 from garps_core.depth_errors import DEPTH_MODES, depth_modes
 from garps_core.geometry import Array, adjoint, se3_inverse
+from garps_core.objective.packed import moved_rows, unpack
 from garps_core.objective.pairs import DeviceMixture
-from garps_core.objective.shape import Evaluation, Pairs, combine, evaluate, moved_rows, row_sums, unpack
+from garps_core.objective.shape import Evaluation, Pairs, derivatives, evaluate
 from garps_core.objective.state import State
 
 MODES = DEPTH_MODES
@@ -56,12 +57,13 @@ def evaluate_jointly(pairs: Pairs, T: Array, of_rows: Array, of_partners: Array)
     there = arm * (1 + rows_modes @ by_rows)[:, None] + t
     partner_modes = depth_modes(there)
     mu = there * (1 - partner_modes @ by_partners)[:, None]
-    _, S = moved_rows(pairs, T)
+    _, S = moved_rows(pairs.means, pairs.covariances, T)
     packed = mu.T.to(S.dtype).contiguous()
-    sums = row_sums(pairs, packed, S)
+    sums = pairs.backend.row_sums(packed, S, *pairs.partners)
     weights, s = pairs.weights.double(), sums[0].double()
     c = weights / (1 + s)
-    gradient, information, observed = combine(c, sums, packed, S, weights)
+    moments = pairs.backend.moments(c, 1 / weights.clamp_min(1e-300), sums, packed, S)
+    gradient, information, observed = derivatives(*moments)
     scaled = sums[1:].double() * c
     U, Q, A = scaled[:3].T, unpack(scaled[3:9].T), unpack(scaled[9:].T)
     missing = A - U[:, :, None] * U[:, None, :] / weights.clamp_min(1e-300)[:, None, None]

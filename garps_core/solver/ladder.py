@@ -1,43 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maximum a posteriori alignment by damped second-order steps over an annealing ladder.
+"""Maximum a posteriori alignment: Levenberg-Marquardt steps over an annealing ladder.
 
-    maximise  information * L(T) - r' Lambda_0 r / 2,     r = log(T T_0^-1) as a left twist
+    maximise  weight * L(T) - r' Lambda_0 r / 2,     r = log(T T_0^-1) as a left twist
 
 L is the mean of the objective seen from the source and from the target, so swapping the views gives the inverse
-pose. Lambda_0 is the inverse covariance of the initial pose, converted to the left twist.
+pose. Lambda_0 is the inverse covariance of the start T_0, converted to the left twist. The weight is the number of
+effective measurements (`data_weight`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from garps_core.config import Alignment, Rung
+from garps_core.config import Rung
 from garps_core.geometry import Array, displacement, se3_inverse, se3_log, skew
+from garps_core.objective.packed import unpack
 from garps_core.objective.pairs import DeviceMixture, pair_up, thin, visible
-from garps_core.objective.shape import Evaluation, Pairs, unpack
+from garps_core.objective.shape import Evaluation, Pairs
 from garps_core.objective.state import State, WeightedStart
 from garps_core.objective.with_depth_errors import corrected, evaluate_at, two_sided
+from garps_core.solver.problem import Problem
 
-_SECOND_DIRECTION = ThreadPoolExecutor(1, thread_name_prefix="second_direction")
-"""Compiled loops release the interpreter: target to source is computed beside source to target."""
 MIN_ROWS = 50
+"""Fewest components that both cameras see, per view, on which a pose may rest."""
 SMALLEST_CURVATURE = 0.1
-"""Steps are at most this much (its inverse) longer than Gauss-Newton's: further, the curvature is not to be trusted."""
+"""Lower bound on observed / Gauss-Newton curvature; a step is at most 10 times a Gauss-Newton step."""
 FINAL_ROWS, FINAL_NEIGHBOURS, FINAL_DENSITY = 800, 50, 2.0
-"""Pairs on which covariance and verdict rest: with few or sparse partners, cut-off kernels look like information."""
+"""Size of the pairs on which covariance and verdict rest; with few or sparse partners, cut-off kernels look like
+information."""
 FOOTPRINT_M = 3.2e-3
-"""Typical sigma of a component across its ray: compares a blur, in metres, with a scale."""
+"""Typical sigma of a component across its ray (m); it makes a blur comparable with a covariance scale."""
 ENTRY_WIDTH = 0.7
-"""A rung is skipped when the next one's kernels are still wider than this many times the start's uncertainty."""
+"""A rung is skipped if the kernels of the next one are wider than this many sigmas of the start."""
+FIRST_DAMPING, SMALLEST_DAMPING = 1e-3, 1e-6
+"""Levenberg-Marquardt damping, as a share of the curvature's diagonal."""
+GROWTH, DECAY = 10, 0.2
+"""Factors on the damping after a rejected and after an accepted step."""
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Log posterior at a pose with its derivatives over a left twist, and the data term alone."""
+    """Log posterior at a state with gradient and curvature over the state's step, and the data term alone."""
 
     value: float
     gradient: Array
@@ -47,18 +54,20 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the solver stopped."""
+    """A state at which a solver stopped."""
 
     at: State
     posterior: Posterior
     iterations: int
     converged: bool
     weight: float
-    """What the data term was multiplied with: effective number of independent measurements of the last rung."""
+    """Factor on the data term: the effective number of independent measurements on the last rung."""
     data: Evaluation
     """The data term at T, for the covariance and the verdict."""
     pairs: tuple[Pairs, Pairs] | None = None
-    """What `data` was evaluated on: source rows to target partners, and target rows to source partners."""
+    """Pairs on which `data` was evaluated: source rows to target partners, and target rows to source partners."""
+    fixed_steps: bool = False
+    """The method takes a fixed number of steps and has no test of convergence."""
 
     @property
     def T(self) -> Array:
@@ -66,14 +75,14 @@ class Solution:
         return self.at.T
 
 
-def two_way(forward: Pairs, backward: Pairs, at: State) -> Evaluation:
+def two_way(forward: Pairs, backward: Pairs, at: State, pool: Executor) -> Evaluation:
     """Mean of the "log" objective of source rows moved by T and of target rows moved by T^-1, over the state's step."""
-    other = _SECOND_DIRECTION.submit(evaluate_at, backward, at, True)
+    other = pool.submit(evaluate_at, backward, at, True)
     return two_sided(evaluate_at(forward, at), other.result(), at.T)
 
 
 BERNOULLI = (1 / 12, -1 / 720, 1 / 30240, -1 / 1209600, 1 / 47900160)
-"""Coefficients of ad^2, ad^4 ... in x / (e^x - 1) + x / 2 - 1; with these the error is below 1e-5 up to 2 rad."""
+"""Coefficients of ad^2, ad^4 ... in x / (e^x - 1) + x / 2 - 1; the error is below 1e-5 up to 2 rad."""
 
 
 def inverse_left_jacobian(twist: Array) -> Array:
@@ -90,11 +99,11 @@ def inverse_left_jacobian(twist: Array) -> Array:
 
 
 def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE, open_below: float = -np.inf) -> Array:
-    """Observed information, kept between `smallest` and 1 times the Gauss-Newton information per direction.
+    """Observed information, clipped per direction to between `smallest` and 1 times the Gauss-Newton information.
 
-    Gauss-Newton holds the assignment of partners fixed and so takes steps that are too short (expectation
-    maximisation); the observed information knows that partners change, but may be indefinite far from the optimum.
-    Directions that keep less than the share `open_below` are given `smallest`.
+    Gauss-Newton holds the assignment of partners fixed (expectation maximisation), so its steps are too short. The
+    observed information includes the change of partners, but may be indefinite far from the optimum.
+    A direction whose share is less than `open_below` gets `smallest`.
     """
     values, half, scale = _shares(data)
     half = half * np.sqrt(np.where(values < open_below, smallest, np.clip(values, smallest, 1.0)))
@@ -104,17 +113,17 @@ def curvature(data: Evaluation, smallest: float = SMALLEST_CURVATURE, open_below
 def _shares(data: Evaluation) -> tuple[Array, Array, Array]:
     """Eigenvalues of the observed in units of the Gauss-Newton information, their directions, and the scaling used."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.information), 1e-12))
-    floor = (1e-9 if len(scale) == 6 else 1e-6) * np.eye(len(scale))  # depth errors and pose are hardly told apart
+    floor = (1e-9 if len(scale) == 6 else 1e-6) * np.eye(len(scale))  # depth errors and pose are nearly collinear
     L = np.linalg.cholesky(data.information * np.outer(scale, scale) + floor)
     inner = np.linalg.solve(L, np.linalg.solve(L, data.observed * np.outer(scale, scale)).T)
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
     return values, L @ vectors, scale
 
 
-def posterior(data: Evaluation, at: State, known: WeightedStart, weight: float) -> Posterior:
-    """Add the prior to `weight` times the data term."""
-    r = np.concatenate([se3_log(at.T @ se3_inverse(known.T)), at.errors])
-    J, precision = np.eye(len(r)), known.joint()
+def posterior(data: Evaluation, at: State, start: WeightedStart, weight: float) -> Posterior:
+    """`weight` times the data term plus the Gaussian log prior of the start."""
+    r = np.concatenate([se3_log(at.T @ se3_inverse(start.T)), at.errors])
+    J, precision = np.eye(len(r)), start.joint()
     J[:6, :6] = inverse_left_jacobian(r[:6])
     return Posterior(
         weight * data.value - 0.5 * float(r @ precision @ r),
@@ -126,7 +135,7 @@ def posterior(data: Evaluation, at: State, known: WeightedStart, weight: float) 
 
 @dataclass(frozen=True)
 class Ascent:
-    """Where one rung ended."""
+    """End of one Levenberg-Marquardt ascent."""
 
     at: State
     posterior: Posterior
@@ -135,38 +144,40 @@ class Ascent:
 
 
 def ascend(function: Callable[[State], Posterior], at: State, steps: int, tolerance: float) -> Ascent:
-    """Levenberg-damped ascent: at most `steps` evaluations after the first, never downhill.
+    """Levenberg-Marquardt ascent: at most `steps` evaluations after the first; a step that loses value is rejected.
 
-    Stops when the undamped step is shorter than `tolerance` in its own metric, sqrt(step' H step): its size in sigmas.
+    It has converged when the undamped Newton step is shorter than `tolerance` in the metric of the curvature,
+    sqrt(step' H step): its length in sigmas.
     """
     here = function(at)
     floor = 1e-12 * np.eye(len(here.gradient))
-    damping, used = 1e-3, 0
-    while used < steps:
+    damping, used = FIRST_DAMPING, 0
+    while not (converged := _squared_step(here, floor) < tolerance**2) and used < steps:
         H = here.information
-        if float(here.gradient @ np.linalg.solve(H + floor, here.gradient)) < tolerance**2:
-            return Ascent(at, here, used, True)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + floor, here.gradient)
         candidate = at.moved(np.asarray(step, np.float64))
         there = function(candidate)
         used += 1
         if there.value >= here.value:
-            at, here, damping = candidate, there, max(damping * 0.2, 1e-6)
+            at, here, damping = candidate, there, max(damping * DECAY, SMALLEST_DAMPING)
         else:
-            damping = max(damping, 1e-3) * 10
-    return Ascent(at, here, used, False)
+            damping = max(damping, FIRST_DAMPING) * GROWTH
+    return Ascent(at, here, used, converged)
 
 
-def rung_pairs(
-    source: DeviceMixture, target: DeviceMixture, T: Array, rung: Rung, settings: Alignment, density: float
-) -> tuple[Pairs, Pairs] | None:
+def _squared_step(here: Posterior, floor: Array) -> float:
+    """Squared length of the undamped Newton step in the metric of the curvature, in sigmas squared."""
+    return float(here.gradient @ np.linalg.solve(here.information + floor, here.gradient))
+
+
+def rung_pairs(problem: Problem, T: Array, rung: Rung, density: float) -> tuple[Pairs, Pairs] | None:
     """Pairs in both directions among the components that both cameras see under T; None when too few are left.
 
-    Rows are thinned to the rung's components, partners only to the rung's resolution: a covariance scaled by s covers
-    s components, and `density` partners are kept for each such kernel. Two equally thin mixtures would be two grids,
-    and a textureless wall would snap from grid to grid.
+    Rows are thinned to the rung's components. Partners are thinned to the rung's resolution only: a covariance scaled
+    by s covers s components, and `density` partners are kept for each such kernel. If both mixtures were equally thin,
+    a textureless wall would snap from grid to grid.
     """
-    back = se3_inverse(T)
+    source, target, settings, back = problem.source, problem.target, problem.settings, se3_inverse(T)
     x, y = _at_resolution(source, rung, density), _at_resolution(target, rung, density)
     hidden_beyond = rung.occlusion_ratio or settings.occlusion_ratio
     x_seen = x.take(visible(x, T, target.frustum, hidden_beyond))
@@ -175,18 +186,19 @@ def rung_pairs(
     y_rows = thin(y_seen, int(np.ceil(len(y_seen) * min(1.0, rung.components / len(y)))))
     if min(len(x_rows), len(y_rows)) < MIN_ROWS:
         return None
-    other = _SECOND_DIRECTION.submit(pair_up, y_rows, x_seen, back, rung, settings)
+    other = problem.pool.submit(pair_up, y_rows, x_seen, back, rung, settings)
     return pair_up(x_rows, y_seen, T, rung, settings), other.result()
 
 
-def _at_resolution(cloud: DeviceMixture, rung: Rung, density: float) -> DeviceMixture:
-    return thin(cloud, max(rung.components, int(density * len(cloud) / max(rung.covariance_scale, 1.0))))
+def _at_resolution(mixture: DeviceMixture, rung: Rung, density: float) -> DeviceMixture:
+    return thin(mixture, max(rung.components, int(density * len(mixture) / max(rung.covariance_scale, 1.0))))
 
 
 def entry(source: DeviceMixture, T: Array, covariance: Array, ladder: tuple[Rung, ...]) -> int:
-    """Index of the first rung worth running: a precise start needs no wide kernels.
+    """Index of the first rung to run: a precise start needs no wide kernels.
 
-    covariance is the start's, over the left twist. Its effect on the source points is compared with the rungs' widths.
+    `covariance` (6, 6) is the start's, over the left twist. Its effect on the source points is compared with the
+    widths of the rungs' kernels.
     """
     few = thin(source, 200)
     points = few.means.double().cpu().numpy() @ T[:3, :3].T + T[:3, 3]
@@ -199,27 +211,21 @@ def entry(source: DeviceMixture, T: Array, covariance: Array, ladder: tuple[Rung
     return first
 
 
-def anneal(source: DeviceMixture, target: DeviceMixture, known: WeightedStart, settings: Alignment) -> list[Solution]:
-    """Run the ladder from what is known beforehand: one solution, none when a rung finds too few visible components."""
-    covariance = np.asarray(np.linalg.inv(known.precision), np.float64)
-    at = State(known.T, np.zeros(len(known.error_precision)))
-    rungs = settings.ladder[entry(source, known.T, covariance, settings.ladder) :]
-    solution = run_ladder(source, target, at, known, rungs, settings)
-    return [] if solution is None else [with_final_pairs(solution, source, target, settings)]
+def anneal(problem: Problem) -> list[Solution]:
+    """Run the ladder from the start: one solution, or none when a rung finds too few visible components."""
+    start, ladder = problem.start, problem.settings.ladder
+    covariance = np.asarray(np.linalg.inv(start.precision), np.float64)
+    rungs = ladder[entry(problem.source, start.T, covariance, ladder) :]
+    solution = run_ladder(problem, problem.state(start.T), rungs)
+    return [] if solution is None else [with_final_pairs(solution, problem)]
 
 
-def run_ladder(
-    source: DeviceMixture,
-    target: DeviceMixture,
-    at: State,
-    known: WeightedStart,
-    rungs: tuple[Rung, ...],
-    settings: Alignment,
-) -> Solution | None:
-    """Ascent on one rung after the other, each on pairs chosen where the last one ended."""
+def run_ladder(problem: Problem, at: State, rungs: tuple[Rung, ...]) -> Solution | None:
+    """One ascent per rung, each on pairs chosen at the end of the last one; None when too few components are seen."""
+    settings = problem.settings
     used, solution = 0, None
     for rung in rungs:
-        pairs = pairs_at(source, target, at, rung, settings, settings.partner_density)
+        pairs = pairs_at(problem, at, rung, settings.partner_density)
         if pairs is None:
             return None
         weight = settings.effective_measurements * data_weight(rung)
@@ -227,7 +233,8 @@ def run_ladder(
         def function(
             there: State, pairs: tuple[Pairs, Pairs] = pairs, weight: float = weight, base: State = at
         ) -> Posterior:
-            return posterior(two_way(*pairs, relative_to(there, base)), there, known, weight)
+            data = two_way(*pairs, relative_to(there, base), problem.pool)
+            return posterior(data, there, problem.start, weight)
 
         end = ascend(function, at, rung.steps, settings.tolerance)
         at, used = end.at, used + end.iterations
@@ -236,31 +243,33 @@ def run_ladder(
 
 
 def relative_to(at: State, base: State) -> State:
-    """The state as pairs that are corrected by the errors of `base` see it."""
+    """The state relative to pairs that are already corrected by the errors of `base`."""
     return State(at.T, at.errors - base.errors)
 
 
 def data_weight(rung: Rung) -> float:
-    """How much a rung's data term counts: wider kernels anneal, they do not measure less."""
+    """Factor that keeps the weight of the data against the prior the same on a wide rung as on a narrow one."""
     return max(rung.covariance_scale, (0.5 * rung.blur_m / FOOTPRINT_M) ** 2)
 
 
-def pairs_at(
-    source: DeviceMixture, target: DeviceMixture, at: State, rung: Rung, settings: Alignment, density: float
-) -> tuple[Pairs, Pairs] | None:
-    """`rung_pairs` of the clouds as the state's errors correct them."""
+def pairs_at(problem: Problem, at: State, rung: Rung, density: float) -> tuple[Pairs, Pairs] | None:
+    """`rung_pairs` of the mixtures after the state's depth errors are corrected."""
     half = len(at.errors) // 2
-    x, y = corrected(source, at.errors[:half]), corrected(target, at.errors[half:])
-    return rung_pairs(x, y, at.T, rung, settings, density)
+    x, y = corrected(problem.source, at.errors[:half]), corrected(problem.target, at.errors[half:])
+    return rung_pairs(replace(problem, source=x, target=y), at.T, rung, density)
 
 
-def with_final_pairs(solution: Solution, source: DeviceMixture, target: DeviceMixture, settings: Alignment) -> Solution:
-    """The solution with its last rung's data seen again at the final pose, with many partners per row."""
-    rung = replace(settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
-    pairs = pairs_at(source, target, solution.at, rung, settings, FINAL_DENSITY)
+def with_final_pairs(solution: Solution, problem: Problem) -> Solution:
+    """The solution with the data term of the last rung evaluated anew at its pose, with many partners per row."""
+    pairs = final_pairs(solution.at, problem)
     if pairs is None:
         return solution
-    here = relative_to(solution.at, solution.at)
-    return replace(
-        solution, pairs=pairs, data=two_way(*pairs, here), weight=settings.effective_measurements * data_weight(rung)
-    )
+    data = two_way(*pairs, relative_to(solution.at, solution.at), problem.pool)
+    weight = problem.settings.effective_measurements * data_weight(problem.settings.ladder[-1])
+    return replace(solution, pairs=pairs, data=data, weight=weight)
+
+
+def final_pairs(at: State, problem: Problem) -> tuple[Pairs, Pairs] | None:
+    """Pairs of the last rung at a state, with many partners per row; None when too few components are seen."""
+    rung = replace(problem.settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
+    return pairs_at(problem, at, rung, FINAL_DENSITY)

@@ -11,11 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.config.start import Start
+from garps_core.edges import MATCH_EDGE_RATIO, MATCH_SLACK_M, one_surface
 from garps_core.geometry import Array, pixel_rays
 from garps_core.types import View
-
-RELIEF_RATIO = 0.03
-"""Depth that varies by more than this share in 5x5 pixels lies on a silhouette: the reading may be of either side."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def points_at(view: View, px: Array) -> Array:
     nearest = np.where(seen, patch, np.inf).min(1)
     farthest = np.where(seen, patch, -np.inf).max(1)
     z = patch[:, patch.shape[1] // 2]
-    flat = farthest - nearest < RELIEF_RATIO * nearest + 0.005
+    flat = one_surface(nearest, farthest, MATCH_EDGE_RATIO, MATCH_SLACK_M)
     mean = np.where(seen, patch, 0).sum(1) / np.maximum(seen.sum(1), 1)
     z = np.where(flat & np.isfinite(z), mean, np.nan)  # the patch mean carries less noise than its centre
     return np.asarray(pixel_rays(view.K, px[:, 0], px[:, 1]) * z[:, None])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -12,15 +13,17 @@ from garps_core.checks import Float64Array
 from garps_core.errors import ReconstructionError
 from garps_core.geometry import skew, so3_log
 from garps_core.types import PoseEstimate, View
+from garps_ros.parameters.settings import NodeSettings
 
-Estimator = Callable[[View, View], PoseEstimate]
+Estimate = Callable[[View, View], PoseEstimate]
+"""A function (source, target) -> pose of the source camera in the target camera."""
 MIN_DEPTH_SHARE = 0.02
-"""A view with depth at a smaller share of its pixels begins no segment: a covered lens, not a sparse sensor."""
+"""Share of pixels with depth below which a view begins no segment; it tells a covered lens from a sparse sensor."""
 
 
 @dataclass(frozen=True)
 class KeyframeRule:
-    """When the camera is so far from its keyframe that a new one is taken.
+    """Limits beyond which a new keyframe is taken.
 
     Args:
         min_overlap: new keyframe when the overlap (0..1) falls below.
@@ -30,10 +33,10 @@ class KeyframeRule:
         min_depth_share: a view with depth at a smaller share of its pixels begins no segment.
     """
 
-    min_overlap: float = 0.5
-    max_motion_m: float = 0.3
-    max_rotation_rad: float = 0.35
-    lost_after: int = 5
+    min_overlap: float = NodeSettings.keyframe_overlap
+    max_motion_m: float = NodeSettings.keyframe_motion
+    max_rotation_rad: float = math.radians(NodeSettings.keyframe_rotation)
+    lost_after: int = NodeSettings.keyframe_lost_after
     min_depth_share: float = MIN_DEPTH_SHARE
 
 
@@ -53,7 +56,7 @@ class Attempt:
 
 @dataclass(frozen=True, eq=False)
 class _Located:
-    """A view and the pose of its camera in the segment's first keyframe; covariance None = it is that keyframe."""
+    """A view with its camera's pose in the first keyframe of the segment; covariance None = it is that keyframe."""
 
     view: View
     T: Float64Array
@@ -69,20 +72,20 @@ class KeyframeTracker:
         segment: the last one of an earlier tracker, to count on from.
     """
 
-    def __init__(self, estimate: Estimator, rule: KeyframeRule, segment: int = 0) -> None:
+    def __init__(self, estimate: Estimate, rule: KeyframeRule, segment: int = 0) -> None:
         self._estimate, self.rule = estimate, rule
         self._keyframe: _Located | None = None
         self._last: _Located | None = None
         self._failures = 0
         self._was_blank = False
-        """Of the last view."""
+        """The last view had too little depth to begin a segment."""
         self.segment = segment
-        """Counts from 1; poses of different segments are not related to each other."""
+        """Number of the segment, from 1; poses of different segments are not related to each other."""
         self.keyframes = 0
 
     @property
     def keyframe_stamp_ns(self) -> int:
-        """Stamp of the present keyframe, 0 before the first."""
+        """Stamp of the present keyframe, ns; 0 before the first."""
         return 0 if self._keyframe is None else self._keyframe.view.stamp_ns
 
     def begins(self, view: View) -> bool:
@@ -99,7 +102,7 @@ class KeyframeTracker:
                 f"the view has depth at {share:.1%} of its pixels: expected at least {self.rule.min_depth_share:.0%} "
                 "to begin a trajectory; uncover the camera, or check the depth topic"
             )
-        # What was out of sight may be back after a blank view: the keyframe gets one more try.
+        # A covered lens may be uncovered by now: after a blank view the keyframe gets one more try.
         patience = self.rule.lost_after + self._was_blank
         if self._keyframe is not None and (self._failures < patience or share < self.rule.min_depth_share):
             return False
@@ -156,7 +159,7 @@ def _depth_share(view: View) -> float:
 def composed_covariance(
     T_ab: Float64Array, covariance_ab: Float64Array | None, T_bc: Float64Array, covariance_bc: Float64Array
 ) -> Float64Array:
-    """6x6 covariance of T_ab @ T_bc in the ROS meaning, for independent errors; covariance_ab None = T_ab exact.
+    """Return the 6x6 covariance of T_ab @ T_bc (ROS meaning) for independent errors; covariance_ab None = T_ab exact.
 
     With p_ac = R_ab p_bc + p_ab, a small rotation w of T_ab moves p_ac by w x (R_ab p_bc).
     """

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from garps_core.checks import Float64Array
 from garps_core.errors import GarpsError, InputError, ReconstructionError
 from garps_core.types import PoseEstimate, View
-from garps_ros.cameras import Frame
-from garps_ros.estimates.keyframes import Estimator, KeyframeTracker
-from garps_ros.frames.frame import frame_mismatch, view_from_messages
+from garps_ros.estimates.keyframes import Estimate, KeyframeTracker
+from garps_ros.frames.frame import Frame, frame_warning, view_from_messages
 from msg_adapters import MessageError, header_frame_id
 
 FAILURES: dict[type[Exception], str] = {
@@ -23,7 +22,7 @@ FAILURES: dict[type[Exception], str] = {
 OTHER_FAILURE = "core_error"
 
 Completed = Callable[[View], View]
-"""Gives a view the depth that its estimates are made from."""
+"""A function that gives a view the depth that its estimates are made from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Origin:
-    """A trajectory begins; with a stamp, its first pose is the identity at that time."""
+    """The start of a trajectory; with a stamp (ns), its first pose is the identity at that time."""
 
     segment: int
     frame_id: str
@@ -55,7 +54,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A pair: its row, and what to publish (None: nothing).
+    """The row of a pair, and the pose to publish; T None = nothing is published.
 
     Args:
         row: of poses.csv.
@@ -75,10 +74,10 @@ class Outcome:
 
 
 class ViewReader:
-    """Frame -> View; says which calibration is used, once and whenever that changes.
+    """Makes a View of a Frame; says which calibration is used, at first and whenever that changes.
 
     Args:
-        rectified: "auto", "true" or "false".
+        rectified: "auto", "rectified" or "raw".
         say: called with a line for people.
         allow_resized: accept images that were scaled evenly against their CameraInfo.
     """
@@ -86,8 +85,8 @@ class ViewReader:
     def __init__(self, rectified: str, say: Callable[[str], None], allow_resized: bool = False) -> None:
         self.rectified, self.allow_resized, self._say = rectified, allow_resized, say
         self._said: dict[str, str] = {}
-        self.doubts: dict[str, str] = {}
-        """By topic: why the last frame read may hold another camera's calibration or depth."""
+        self.warnings: dict[str, str] = {}
+        """Image topic -> why the last frame read may hold another camera's calibration or depth; "" = no warning."""
 
     def read(self, frame: Frame) -> View:
         """Decode, choose the calibration, undistort. Raises MessageError or InputError."""
@@ -100,8 +99,8 @@ class ViewReader:
             rectified=self.rectified,
             allow_resized=self.allow_resized,
         )
-        self.doubts[topic] = frame_mismatch(frame.image, frame.info, frame.depth)
-        told = f"{decision}; {self.doubts[topic]}" if self.doubts[topic] else decision
+        self.warnings[topic] = frame_warning(frame.image, frame.info, frame.depth)
+        told = f"{decision}; {self.warnings[topic]}" if self.warnings[topic] else decision
         if self._said.get(topic) != told:
             self._said[topic] = told
             self._say(f"{topic}: {told}")
@@ -109,9 +108,9 @@ class ViewReader:
 
 
 def estimate_pairs(
-    pairs: Iterable[tuple[Frame, Frame]], reader: ViewReader, estimate: Estimator
+    pairs: Iterable[tuple[Frame, Frame]], reader: ViewReader, estimate: Estimate
 ) -> Iterator[Origin | Outcome]:
-    """Two cameras: the pose of the first of each pair (source) in the second (target)."""
+    """Estimate the pose of the first camera of each pair (source) in the second (target)."""
     begun = False
     for source, target in pairs:
         outcome = estimate_pair(source, target, reader, estimate)
@@ -121,8 +120,8 @@ def estimate_pairs(
         yield outcome
 
 
-def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimator) -> Outcome:
-    """The pose of the source camera in the target camera, or why there is none."""
+def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Estimate) -> Outcome:
+    """Estimate the pose of the source camera in the target camera; the outcome says why there is none."""
     began = time.perf_counter()
     source_name, target_name = names = frame_names(source, target)
     stamps = source.stamp_ns, target.stamp_ns
@@ -138,7 +137,7 @@ def estimate_pair(source: Frame, target: Frame, reader: ViewReader, estimate: Es
 def estimate_keyframes(
     frames: Iterable[Frame], reader: ViewReader, tracker: KeyframeTracker, completed: Completed = lambda view: view
 ) -> Iterator[Origin | Outcome]:
-    """One camera: its pose in the first keyframe of the segment; rows hold the pose in the keyframe that was used."""
+    """Estimate one camera's pose in the first keyframe of its segment; rows hold the pose in the keyframe used."""
     for frame in frames:
         yield from follow_frame(frame, reader, tracker, completed)
 
@@ -146,7 +145,7 @@ def estimate_keyframes(
 def follow_frame(
     frame: Frame, reader: ViewReader, tracker: KeyframeTracker, completed: Completed = lambda view: view
 ) -> Iterator[Origin | Outcome]:
-    """One more frame of the camera: an Origin where a segment begins, else every attempt at a pose.
+    """Follow the camera to one more frame; yield an Origin where a segment begins, else every attempt at a pose.
 
     A view is `completed` once, however many estimates it takes part in.
     """
@@ -174,7 +173,7 @@ def _start_name(name: str, tracker: KeyframeTracker) -> str:
 
 
 def failed_outcome(frames: tuple[Frame, ...], error: Exception) -> Outcome:
-    """The outcome of one or two frames that ended in an error nobody expected."""
+    """Return the outcome of one or two frames that ended in an unexpected error."""
     source, target = frames[0], frames[-1]
     names = frame_names(source, target) if len(frames) == 2 else (frame_name(source), frame_name(source))
     row = _failed((source.stamp_ns, target.stamp_ns), names, 0, error)
@@ -182,13 +181,13 @@ def failed_outcome(frames: tuple[Frame, ...], error: Exception) -> Outcome:
 
 
 def frame_names(source: Frame, target: Frame) -> tuple[str, str]:
-    """Frame names of both cameras; those of their topics where the drivers give none, or the same to both."""
+    """Return the frame names of both cameras, from their topics where the drivers give none, or one name to both."""
     names = header_frame_id(source.image), header_frame_id(target.image)
     return names if all(names) and names[0] != names[1] else (_topic_name(source), _topic_name(target))
 
 
 def frame_name(frame: Frame) -> str:
-    """Frame name of a camera by itself; that of its topic where the driver gives none."""
+    """Return the frame name of one camera, from its topic where the driver gives none."""
     return header_frame_id(frame.image) or _topic_name(frame)
 
 

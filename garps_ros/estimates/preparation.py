@@ -10,8 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from garps_core.align import NETWORKS as SHARED
-from garps_core.align import estimate_relative_pose
+from garps_core.align import Estimator
 from garps_core.config import Config, Reconstruction, depth_networks
 from garps_core.config.combinations import check_settings, check_start
 from garps_core.config.lifting import Lifting
@@ -50,9 +49,9 @@ def check_method(config: Config) -> None:
         check_settings(config)
 
 
-def completed(view: View, config: Config) -> View:
-    """A view by itself with what its mixture needs; a two-view network gives nothing before it sees a pair."""
-    return view if config.reconstruction.method == "two_view" else with_depth([view], config, SHARED)[0]
+def completed(view: View, config: Config, networks: Networks) -> View:
+    """Return a view with the depth that its mixture needs. A two-view network gives none before it sees a pair."""
+    return view if config.reconstruction.method == "two_view" else with_depth([view], config, networks)[0]
 
 
 def depth_share(config: Config) -> float:
@@ -91,7 +90,7 @@ def two_view_name(config: Config) -> str:
     return f"{start.method} (weights {start.weights or default(start.method).name})"
 
 
-def load_networks(config: Config, say: Callable[[str], None], networks: Networks = SHARED) -> None:
+def load_networks(config: Config, say: Callable[[str], None], networks: Networks) -> None:
     """Load the networks that the settings name, if any, into `networks`, and say what it took.
 
     Raises:
@@ -126,7 +125,7 @@ def warm_up(config: Config, say: Callable[[str], None]) -> None:
     begin, view = time.perf_counter(), _corner()
     # Own settings but for what could leave nothing of so small a picture.
     tiny = replace(config, reconstruction=Reconstruction(method="rgbd"), lifting=Lifting(), start=Start())
-    estimate_relative_pose(view, view, tiny, Prior(np.eye(4), np.eye(6) * 1e-4))
+    Estimator(tiny).estimate(view, view, Prior(np.eye(4), np.eye(6) * 1e-4))
     if (spent := time.perf_counter() - begin) > LONG_S:
         say(f"compiled the innermost loops in {spent:.1f} s; where they can be kept, the next start is quick")
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages -> frames: images, depth and calibration of one instant."""
+"""Messages -> frames: `stamps` pairs two streams, `assembly` joins a frame, `frame` makes it a View."""

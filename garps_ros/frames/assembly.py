@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image, depth and calibration to frames, frames of two cameras to pairs; the same rules offline and live."""
+"""Image, depth and calibration -> frames; frames of two cameras -> pairs. The rules are the same offline and live."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from garps_ros.cameras import CameraTopics, Frame
+from garps_ros.frames.frame import CameraTopics, Frame
 from garps_ros.frames.stamps import Pairer
 from msg_adapters import MessageError, header_stamp_ns
 
 IMAGE, DEPTH = 0, 1
 
 Complete = list[tuple[Frame, ...]]
-"""What belongs together: (source, target), or (source,) where there is one camera."""
+"""Frames that belong together: (source, target), or (source,) where there is one camera."""
 
 
 class Assembly:
-    """Takes messages in any order of topics, in order of time within each.
+    """Joins messages to frames and pairs; topics may come in any order, each topic in order of time.
 
     Args:
         cameras: [source, target], or [source] alone; one without a depth topic gives frames without depth.
@@ -36,13 +36,13 @@ class Assembly:
         self._without_info: list[tuple[Any, Any] | None] = [None] * len(cameras)
 
     def add_info(self, index: int, message: Any) -> Complete:
-        """Keep the newest calibration of a camera; an image that came before the first has waited for it."""
+        """Keep the newest calibration of a camera; return what became complete with an image that waited for it."""
         self._infos[index] = message
         waiting, self._without_info[index] = self._without_info[index], None
         return self._framed(index, *waiting) if waiting else []
 
     def add(self, index: int, role: int, message: Any) -> Complete:
-        """Take an image or depth of a camera; returns what became complete."""
+        """Take an image or depth of a camera; return what became complete."""
         camera = self._cameras[index]
         topic = (camera.image, camera.depth)[role]
         try:
@@ -58,12 +58,12 @@ class Assembly:
         return self._all_framed(index, pairs or [])
 
     def settle(self) -> Complete:
-        """What waited for a better partner and need not any more, because nothing has come for a while."""
+        """Return the pairs that wait for a better partner although nothing has come for a while."""
         complete = [c for i, pairer in enumerate(self._with_depth) for c in self._all_framed(i, pairer.settle())]
         return complete + list(self._between.settle())
 
     def finish(self) -> Complete:
-        """The same when nothing will come any more."""
+        """Return the pairs that wait for a better partner, and drop the rest, because nothing will come any more."""
         complete = [c for i, pairer in enumerate(self._with_depth) for c in self._all_framed(i, pairer.finish())]
         for index, waiting in enumerate(self._without_info):
             if waiting is not None:
@@ -71,16 +71,16 @@ class Assembly:
         return complete + list(self._between.finish())
 
     def change_slop(self, slop_ns: int) -> None:
-        """From now on stamps may differ by so much, ns."""
+        """Change the largest difference of stamps that belong together, ns."""
         for pairer in self._pairers:
             pairer.slop_ns = slop_ns
 
     def calibrations(self) -> list[Any]:
-        """The newest CameraInfo of each camera, None before the first."""
+        """Return the newest CameraInfo of each camera, None before the first."""
         return list(self._infos)
 
     def newest_ns(self, index: int, role: int) -> int:
-        """Newest stamp of a stream, ns; -1 before the first."""
+        """Return the newest stamp of a stream, ns; -1 before the first."""
         return self._with_depth[index].latest[role]
 
     @property
@@ -89,7 +89,7 @@ class Assembly:
         return sum(sum(pairer.unpaired) for pairer in self._pairers)
 
     def gaps_s(self) -> dict[str, float]:
-        """How far the newest stamps of streams that belong together lie apart, s; for the diagnosis of no pairs."""
+        """Return the distances between the newest stamps of streams that belong together, s, by their topics."""
         names = [(camera.image, camera.depth) for camera in self._cameras]
         if len(self._cameras) == 2:
             names.append((self._cameras[0].image, self._cameras[1].image))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairing of two message streams by their stamps; the same rule offline and live."""
+"""Pairing of two message streams by their stamps. The rule is the same offline and live."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 MAX_WAITING, MAX_WAITING_LIVE = 60, 15
-"""Items that wait for a partner. A camera's image and depth are several MB: live, half a second of them is enough."""
+"""Most items that wait for a partner. A camera's image and depth are several MB: live, half a second is enough."""
 INTERVALS = 20
 ENOUGH_INTERVALS = 3
 
@@ -38,7 +38,7 @@ class Pairer:
         """Newest stamp of each stream, ns; -1 before the first."""
 
     def add(self, stream: int, stamp_ns: int, item: Any) -> list[tuple[Any, Any]] | None:
-        """Add an item to stream 0 or 1; returns the pairs that are now certain, or None if its stamp does not grow."""
+        """Add an item to stream 0 or 1; return the pairs that are now certain, or None if its stamp does not grow."""
         if stamp_ns <= self.latest[stream]:
             return None
         if self._intervals is not None and self.latest[stream] >= 0:
@@ -51,11 +51,11 @@ class Pairer:
         return pairs
 
     def settle(self) -> list[tuple[Any, Any]]:
-        """The pairs that waited for a better partner which is overdue; what has no partner goes on waiting."""
+        """Return the pairs that wait for a better partner which is overdue; items without partner go on waiting."""
         return self._matched(finished=True)
 
     def finish(self) -> list[tuple[Any, Any]]:
-        """The pairs that waited for a better partner which can no longer come."""
+        """Return the pairs that wait for a better partner, and drop the items without partner."""
         pairs = self._matched(finished=True)
         for stream in (0, 1):
             while self._waiting[stream]:
@@ -77,7 +77,7 @@ class Pairer:
         return pairs
 
     def _next_is_farther(self, stream: int, gap: int) -> bool:
-        """Whether the next item of the stream, one period on, will be farther than `gap` on the other side."""
+        """Tell whether the next item of the stream, one period on, will be farther away than `gap` (ns)."""
         intervals = self._intervals[stream] if self._intervals else ()
         return len(intervals) >= ENOUGH_INTERVALS and 10 * min(intervals) > 22 * gap
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of one input from the arrivals of its messages: rate, age, delay, and how many seem to be missing."""
+"""Statistics of the arrivals at one input: rate, age, delay, and how many messages seem to be missing."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,23 +12,24 @@ import numpy.typing as npt
 from garps_core.checks import Float64Array
 
 WINDOW = 100
-"""Arrivals that statistics look back on."""
+"""Number of arrivals that statistics look back on."""
 MANY_MISSING = 0.3
+"""Share of missing messages from which on it is reported."""
 PAUSE_S = 5.0
-"""A gap this long is no loss: the publisher has paused."""
+"""Gap of stamps that is a pause of the publisher and no loss, s."""
 NEAR = 0.25
-"""A gap this near to a whole number of periods, in periods, counts as that many."""
+"""Distance from a whole number of periods, in periods, within which a gap counts as that number."""
 LONG = 3
-"""A gap of more periods is none that jitter makes; the error of the period is then too large to ask how near it is."""
+"""Number of periods above which a gap is a loss, however near it is to a whole number: jitter makes none so long."""
 STEADY = 6
-"""So many equal gaps in a row are a period of their own: chance loses messages less evenly."""
+"""Number of equal gaps in a row that make a period of their own: chance loses messages less evenly."""
 SURE_SIGMAS = 3.0
-"""Gaps are of a period when this many standard deviations more of them are near than would be by chance."""
+"""Standard deviations by which the near gaps must outnumber those expected by chance, for a period to be found."""
 SPREAD = 6.0
-"""Gaps that differ by this factor, the extreme tenths left out, are loss even where no period is found."""
+"""Ratio of the ninth to the first decile of the gaps that means loss even where no period is found."""
 ROUNDS = 20
 FEW = 20
-"""Fewer messages say nothing of loss."""
+"""Number of messages below which nothing is said about loss."""
 
 
 class Arrivals:
@@ -40,11 +42,11 @@ class Arrivals:
         self._delays_s: deque[float] = deque(maxlen=WINDOW)
 
     def note(self, now_s: float, stamp_ns: int, clock_ns: int) -> None:
-        """A message has arrived.
+        """Note the arrival of a message.
 
         Args:
             now_s: steady time, s.
-            stamp_ns: of its header, ns.
+            stamp_ns: header stamp, ns.
             clock_ns: the ROS clock, ns; 0 when it is not running.
         """
         self.count += 1
@@ -56,24 +58,24 @@ class Arrivals:
             self._delays_s.append((clock_ns - stamp_ns) * 1e-9)
 
     def age_s(self, now_s: float) -> float | None:
-        """Steady time since the last arrival, s; None before the first."""
+        """Return the steady time since the last arrival, s; None before the first."""
         return now_s - self._times_s[-1] if self._times_s else None
 
     def rate_hz(self, now_s: float, window_s: float = 5.0) -> float:
-        """Arrivals per second over the last few seconds."""
+        """Return the arrivals per second over the last few seconds."""
         recent = [time for time in self._times_s if now_s - time <= window_s]
         if len(recent) < 2:
             return len(recent) / window_s
         return (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
 
     def delay_ms(self) -> tuple[float, float] | None:
-        """Median and largest time from stamp to arrival on the ROS clock, ms; None when that is not known."""
+        """Return median and maximum of the time from stamp to arrival on the ROS clock, ms; None while unknown."""
         if not self._delays_s:
             return None
         return 1000 * float(np.median(self._delays_s)), 1000 * max(self._delays_s)
 
     def missing(self) -> float:
-        """Share of messages that seem to have been lost, from gaps between stamps; 0 while unknown.
+        """Estimate the share of messages that were lost, from gaps between stamps; 0 while unknown.
 
         Lost are those between stamps a whole multiple of the period apart. Jitter makes other gaps, and a camera that
         slows down, as for its exposure, many equal ones: both are no loss.
@@ -85,8 +87,33 @@ class Arrivals:
         return lost / (lost + len(multiples))
 
 
+@dataclass(frozen=True)
+class InputState:
+    """The state of an input at the time of a check.
+
+    Args:
+        role: "source/image" and so on.
+        topic: name of its topic, after remapping.
+        arrivals: of its messages.
+        publishers: number of publishers on the topic.
+        qos: QoS of the subscription, in words.
+        warning: why nothing can arrive; "" when no reason is known.
+        once: one message is enough, because a calibration may be latched.
+        optional: its absence is no error.
+    """
+
+    role: str
+    topic: str
+    arrivals: Arrivals
+    publishers: int
+    qos: str
+    warning: str = ""
+    once: bool = False
+    optional: bool = False
+
+
 def _multiples(gaps_s: Float64Array) -> Float64Array:
-    """How many periods each gap is long; 0 where that is no whole number, or cannot be told."""
+    """Return the length of each gap in periods; 0 where it is no whole number, or cannot be told."""
     ordered_s = np.sort(gaps_s)
     tenth = len(gaps_s) // 10
     far_apart = ordered_s[-1 - tenth] > SPREAD * ordered_s[tenth]
@@ -105,14 +132,14 @@ def _multiples(gaps_s: Float64Array) -> Float64Array:
 
 
 def _refined_s(index: int, ordered_s: Float64Array) -> float:
-    """The median of the gaps of one period, s; starts at the gap of that index, which may be too short for it."""
+    """Return the median of the gaps of one period, s, starting at the gap of that index, which may be too short."""
     for _ in range(ROUNDS):
         index = (int(np.searchsorted(ordered_s, 1.5 * ordered_s[index])) - 1) // 2
     return float(ordered_s[index])
 
 
 def _in_long_run(multiples: Float64Array) -> npt.NDArray[np.bool_]:
-    """For each gap whether it is one of `STEADY` or more equal ones in a row."""
+    """Mark each gap that is one of `STEADY` or more equal ones in a row."""
     ends = np.flatnonzero(np.diff(multiples)) + 1
     lengths = np.diff([0, *ends, len(multiples)])
     return np.repeat(lengths >= STEADY, lengths)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of the live node by their roles: which topics they are, of which type, and who takes their messages."""
+"""The inputs of the live node: topic and type of each, and the function that takes its messages."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from garps_ros.cameras import CameraTopics
 from garps_ros.frames.assembly import DEPTH, IMAGE
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.live.subscriptions import Input
 from garps_ros.parameters.settings import NodeSettings
 
@@ -22,7 +22,7 @@ SIDES = ("source", "target")
 
 @dataclass(frozen=True)
 class Takers:
-    """Who takes the messages; each only stores the reference.
+    """The functions that take the messages; each only stores the reference.
 
     Args:
         image: called with camera (0 = source), IMAGE or DEPTH, and the message.
@@ -38,13 +38,13 @@ class Takers:
 
 
 def camera_topics(node: Node, settings: NodeSettings, depth: bool) -> list[CameraTopics]:
-    """The topics as remapped, by which calibrations are chosen and errors are named; one camera with a keyframe."""
+    """Return the topics of each camera after remapping; with a keyframe there is one camera."""
     parts = ("image", "camera_info", *(["depth"] if depth else []))
     return [CameraTopics(*(node.resolve_topic_name(f"{side}/{part}") for part in parts)) for side in _sides(settings)]
 
 
 def subscribe(node: Node, settings: NodeSettings, depth: bool, takers: Takers) -> list[Input]:
-    """Subscribe to everything that the settings ask for, to depth where that is wanted."""
+    """Subscribe to everything that the settings ask for, and to depth where that is wanted."""
     inputs = []
     for index, side in enumerate(_sides(settings)):
         images = [("image", IMAGE, settings.image_transport), ("depth", DEPTH, settings.depth_transport)]
@@ -67,5 +67,5 @@ def _sides(settings: NodeSettings) -> tuple[str, ...]:
 
 
 def _transported(node: Node, name: str, transport: str) -> tuple[Any, str]:
-    """Type and topic of an image in a transport. Remapping knows the topic without suffix, as for image_transport."""
+    """Return type and topic of an image in a transport; names are remapped without suffix, as image_transport does."""
     return (Image, name) if transport == "raw" else (CompressedImage, f"{node.resolve_topic_name(name)}/{transport}")

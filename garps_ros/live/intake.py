@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of live cameras as they arrive: an assembly that begins anew when time jumps back."""
+"""The intake of live messages: an assembly that begins anew when time jumps back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from garps_ros.cameras import CameraTopics
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly, Complete
+from garps_ros.frames.frame import CameraTopics
 from msg_adapters import MessageError, header_stamp_ns
 
 JUMP_BACK_NS = 1_000_000_000
-"""A stamp this much older than the newest of its stream is no late message: the recording began again."""
+"""Age against the newest stamp of its stream, ns, from which on a message is not late but time has jumped back."""
 STUBBORN = 10
-"""So many older stamps on one stream with no newer one between mean the same: a recording shorter than the jump."""
+"""Number of older stamps in a row that also mean a jump back: the recording is shorter than `JUMP_BACK_NS`."""
 
 
 class Intake:
-    """Puts messages together by the rules of the offline replay (`Assembly`), for as long as time goes on.
+    """Joins messages by the rules of the offline replay (`Assembly`), and begins anew when time jumps back.
 
     Args:
         cameras: [source, target], or [source] alone.
@@ -53,7 +53,7 @@ class Intake:
         self._assembly.change_slop(slop_ns)
 
     def forget(self) -> None:
-        """Drop what waits for a partner; calibrations stay."""
+        """Drop the messages that wait for a partner; calibrations stay."""
         self._unpaired_before += self._assembly.unpaired
         calibrations = self._assembly.calibrations()
         self._begin()
@@ -63,30 +63,30 @@ class Intake:
 
     @property
     def unpaired(self) -> int:
-        """Images without depth, depths without image and frames without partner since the beginning."""
+        """Images without depth, depths without image and frames without partner since the start."""
         return self._unpaired_before + self._assembly.unpaired
 
     def gaps_s(self) -> dict[str, float]:
-        """How far the newest stamps of streams that belong together lie apart, s."""
+        """Return the distances between the newest stamps of streams that belong together, s, by their topics."""
         return self._assembly.gaps_s()
 
     def add_info(self, index: int, message: Any) -> Complete:
-        """Keep the newest calibration of a camera; returns what became complete."""
+        """Keep the newest calibration of a camera; return what became complete."""
         return self._assembly.add_info(index, message)
 
     def add(self, index: int, role: int, message: Any) -> Complete:
-        """Take an image or depth of a camera; returns what became complete."""
+        """Take an image or depth of a camera; return what became complete."""
         self._came = True
         self._watch(index, role, message)
         return self._assembly.add(index, role, message)
 
     def settle(self) -> Complete:
-        """To be called now and then: what has waited for a better partner while nothing came."""
+        """Return the pairs that wait for a better partner if nothing has come since the last call."""
         came, self._came = self._came, False
         return [] if came else self._assembly.settle()
 
     def _watch(self, index: int, role: int, message: Any) -> None:
-        """Begin anew where the stamp says that time has jumped back."""
+        """Begin anew if the stamp shows that time has jumped back."""
         try:
             behind_ns = self._assembly.newest_ns(index, role) - header_stamp_ns(message)
         except MessageError:

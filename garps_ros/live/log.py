@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's log in which no complaint drowns the others: each kind at most every few seconds."""
+"""A node's log that writes each kind of warning at most every few seconds, so that none drowns the others."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 PERIOD_S = 5.0
-"""/diagnostics counts what is left out here."""
+"""Shortest time between two warnings of one kind, s; /diagnostics counts all."""
 
 
 class Log:
@@ -22,16 +22,16 @@ class Log:
         self._last_s: dict[str, float] = {}
 
     def info(self, text: str) -> None:
-        """A line without limit, also from other threads."""
+        """Write a line, without limit and from any thread."""
         self._logger.info(text)
 
     def warn(self, kind: str, text: str) -> None:
-        """A warning, unless one of its kind has just been written."""
+        """Write a warning, unless one of its kind has just been written."""
         if self._due(kind):
             self._logger.warning(text)
 
     def error(self, kind: str, text: str) -> None:
-        """An error, unless one of its kind has just been written."""
+        """Write an error, unless one of its kind has just been written."""
         if self._due(kind):
             self._logger.error(text)
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import rclpy.parameter
@@ -17,17 +20,20 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 
-from garps_core.config import Config
+from garps_core.config import PRESETS, Config
+from garps_core.config.renamed import LOG, current
+from garps_core.config.text import preset_in, read_settings
 from garps_core.devices import checked_device
 from garps_core.errors import ConfigError
 from garps_ros.estimates.preparation import check_method
-from garps_ros.parameters.parameter import Parameter, no_such_parameter, parameters, settings_from
-from garps_ros.parameters.settings import NodeSettings
+from garps_ros.parameters.parameter import PARTS, Parameter, no_such_parameter, parameters, settings_from
+from garps_ros.parameters.settings import NodeSettings, current_rectified
 
 Type = rclpy.parameter.Parameter.Type
 TYPES = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}
-OUR_PREFIXES = ("reconstruction.", "lifting.", "start.", "alignment.")
-ALIKE = 0.83  # names at least this similar to one of ours are taken for a typo; `max_range` (0.82) is not
+OUR_PREFIXES = tuple(f"{part}." for part in PARTS)
+ALIKE = 0.83
+"""Names at least this similar to one of ours are taken for a typo; `max_range` (0.82) is not."""
 
 
 class NodeParameters:
@@ -37,7 +43,9 @@ class NodeParameters:
         node: declares its other parameters before, so that they are not taken for unknown ones.
         changed: called once after every atomic change that made `node` or `config` another one.
 
-    Raises ConfigError on a wrong type, value or name among the values given at the start (file, command line, launch).
+    Raises:
+        ConfigError: a wrong type, value or name among the values given at the start (parameters file, command line,
+            launch file), or in the settings file.
     """
 
     node: NodeSettings
@@ -46,27 +54,36 @@ class NodeParameters:
     def __init__(self, node: Node, changed: Callable[[], None]) -> None:
         self._changed = changed
         overrides: dict[str, rclpy.parameter.Parameter] = node._parameter_overrides
-        _check_names(node, overrides)
-        declared = parameters(_start_preset(overrides))
+        with _warnings_to(node.get_logger()):
+            _rename(overrides)
+            _check_names(node, overrides)
+            preset, self._base = _start_settings(overrides)
+        declared = parameters(preset, self._base)
         self._values = {parameter.name: _start_value(parameter, overrides) for parameter in declared}
-        self.node, self.config = settings_from(self._values)
+        self.node, self.config = settings_from(self._values, self._base)
         checked_device(self.config.device)
         check_method(self.config)
         node.declare_parameters(
             "", [(parameter.name, parameter.default, describe(parameter)) for parameter in declared]
         )
+        node.add_pre_set_parameters_callback(self._in_present_words)
         node.add_on_set_parameters_callback(self._judge)
         node.add_post_set_parameters_callback(self._apply)
+        self._logger = node.get_logger()
+
+    def _in_present_words(self, changes: list[rclpy.parameter.Parameter]) -> list[rclpy.parameter.Parameter]:
+        with _warnings_to(self._logger):
+            return [_in_present_words(change) for change in changes]
 
     def _ours(self, changes: list[rclpy.parameter.Parameter]) -> dict[str, Any]:
         return {change.name: change.value for change in changes if change.name in self._values}
 
     def _judge(self, changes: list[rclpy.parameter.Parameter]) -> SetParametersResult:
-        """Would the settings as a whole still be right? Changes nothing; the reason reaches whoever asked."""
+        """Check the settings as they would be; changes nothing. The reason of a refusal reaches whoever asked."""
         ours = self._ours(changes)
         try:
             if ours:
-                check_method(settings_from(self._values | ours)[1])
+                check_method(settings_from(self._values | ours, self._base)[1])
             if "device" in ours:
                 checked_device(ours["device"])
         except ConfigError as error:
@@ -75,14 +92,14 @@ class NodeParameters:
 
     def _apply(self, changes: list[rclpy.parameter.Parameter]) -> None:
         self._values |= self._ours(changes)
-        node, config = settings_from(self._values)
+        node, config = settings_from(self._values, self._base)
         if (node, config) != (self.node, self.config):
             self.node, self.config = node, config
             self._changed()
 
 
 def describe(parameter: Parameter) -> ParameterDescriptor:
-    """What `ros2 param describe` shows; statically typed, read-only unless live."""
+    """Return the text and limits that `ros2 param describe` shows; statically typed, read-only unless live."""
     one_of = f"one of: {', '.join(parameter.choices)}" if parameter.choices else ""
     notes = "; ".join(note for note in (f"unit: {parameter.unit}" if parameter.unit else "", one_of) if note)
     descriptor = ParameterDescriptor(
@@ -101,25 +118,66 @@ def describe(parameter: Parameter) -> ParameterDescriptor:
     return descriptor
 
 
-def _check_names(node: Node, overrides: Mapping[str, Any]) -> None:
-    """A typo among the values given at the start is an error; a name unlike all of ours is somebody else's."""
+@contextmanager
+def _warnings_to(logger: Any) -> Iterator[None]:
+    """Write warnings of the estimator's settings to a logger of rclpy meanwhile."""
+    handler = logging.Handler()
+    handler.emit = lambda record: logger.warning(record.getMessage())  # type: ignore[method-assign]
+    LOG.addHandler(handler)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+
+
+def _in_present_words(given: rclpy.parameter.Parameter) -> rclpy.parameter.Parameter:
+    """Return the parameter by the name and value it has now, the same object where these are the present ones."""
+    name, value = current(given.name, given.value)
+    if name == "rectified" and isinstance(value, (str, bool)):
+        value = current_rectified(str(value))
+    return given if (name, value) == (given.name, given.value) else rclpy.parameter.Parameter(name, value=value)
+
+
+def _rename(overrides: dict[str, rclpy.parameter.Parameter]) -> None:
+    """Put every value given at the start under the name it has now."""
+    for old, given in list(overrides.items()):
+        now = _in_present_words(given)
+        del overrides[old]
+        overrides.setdefault(now.name, now)
+
+
+def _check_names(node: Node, overrides: Mapping[str, rclpy.parameter.Parameter]) -> None:
+    """Refuse a typo and an expert setting among the values given at the start; note names of other nodes."""
     names = [parameter.name for parameter in parameters()]
-    for name in overrides:
+    for name, given in overrides.items():
         if name in names or node.has_parameter(name):
             continue
-        if name.startswith(OUR_PREFIXES) or difflib.get_close_matches(name, names, n=1, cutoff=ALIKE):
-            raise ConfigError(no_such_parameter(name, names))
+        known = name.startswith(OUR_PREFIXES) or name in Config().settings()
+        if known or difflib.get_close_matches(name, names, n=1, cutoff=ALIKE):
+            raise ConfigError(no_such_parameter(name, given.value))
         note = f"parameter {name!r} is given but is none of this node's: it has no effect here"
         node.get_logger().warning(note)
 
 
-def _start_preset(overrides: Mapping[str, rclpy.parameter.Parameter]) -> str:
-    (preset,) = [parameter for parameter in parameters() if parameter.name == "preset"]
-    return str(_start_value(preset, overrides))
+def _start_settings(overrides: Mapping[str, rclpy.parameter.Parameter]) -> tuple[str, Config]:
+    """Return the preset's name and the settings that preset and settings file make, without single parameters."""
+    by_name = {parameter.name: parameter for parameter in parameters()}
+    asked, file = (str(_start_value(by_name[name], overrides)) for name in ("preset", "settings_file"))
+    if asked not in PRESETS:
+        raise ConfigError(f"preset is {asked!r}: expected one of {', '.join(PRESETS)}")
+    if not file:
+        return asked, Config.preset(asked)
+    path = Path(file).expanduser()
+    try:
+        if "preset" in overrides:
+            return asked, read_settings(path, Config.preset(asked), asked)
+        return preset_in(path) or asked, read_settings(path)
+    except ConfigError as error:
+        raise ConfigError(f"settings_file: {error}") from None
 
 
 def _start_value(parameter: Parameter, overrides: Mapping[str, rclpy.parameter.Parameter]) -> Any:
-    """The value given at the start, else the default. Raises ConfigError on a value of another type."""
+    """Return the value given at the start, else the default. Raises ConfigError on a value of another type."""
     given = overrides.get(parameter.name)
     if given is None:
         return parameter.default
@@ -138,7 +196,7 @@ def _an(word: str) -> str:
 
 
 def _advice(value: Any, default: Any) -> str:
-    """How to write the value so that it has the type of the default, or the default as an example."""
+    """Return how to write the value so that it has the type of the default, or the default as an example."""
     if isinstance(default, str) and isinstance(value, (bool, int, float)):
         quoted = json.dumps(str(value).lower())
         return f"write {quoted} in a file, '{quoted}' in a shell"

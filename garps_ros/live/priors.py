@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that others give beforehand: which belongs to an image, and whether it may be used."""
+"""The poses given on the prior topic: the choice of the one for an image, and its checks."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Priors:
             self._timed.append((stamp_ns, message))
 
     def forget(self, standing: bool = False) -> None:
-        """Drop what belongs to a time; with `standing` also what stands for all times."""
+        """Drop the messages with a stamp; with `standing` also the one that stands for all times."""
         self._timed.clear()
         if standing:
             self._standing = None
 
     def near(self, stamp_ns: int, max_age_ns: int) -> Any:
-        """The message nearest in time, at most `max_age_ns` away (the latest of equals), else the standing one."""
+        """Return the message nearest in time within `max_age_ns` (the latest of equals), else the standing one."""
         nearest = min(reversed(self._timed), key=lambda timed: abs(timed[0] - stamp_ns), default=None)
         if nearest is not None and abs(nearest[0] - stamp_ns) <= max_age_ns:
             return nearest[1]
@@ -47,7 +47,7 @@ class Priors:
 
 
 def prior_from_message(message: Any, target_frame: str) -> Prior:
-    """The prior of a PoseWithCovarianceStamped: the pose of the source camera in `target_frame`.
+    """Make a Prior of a PoseWithCovarianceStamped: the pose of the source camera in `target_frame`.
 
     Raises:
         MessageError: another frame, NaN, no unit quaternion, a covariance of zeros or otherwise none.

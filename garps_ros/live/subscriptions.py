@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions that ask for what suits their publishers, store references only, and know why nothing arrives.
+"""Subscriptions whose QoS suits their publishers, and which know why nothing arrives. Callbacks store references only.
 
-Images are asked for as best effort while they get through. Reliable is for those that do not (beyond 0.5 MB Fast DDS
-loses most of them in its default setting), and not for all: Fast DDS 2.14 can loop for ever in a reliable reader that
-joins messages of more than 64 KB midway, about once in 150 starts, with more shared memory once in 10.
+Images are subscribed as best effort while they get through, and as reliable when they do not: beyond 0.5 MB Fast DDS
+loses most of them in its default setting. Reliable is not for all: Fast DDS 2.14 can loop for ever in a reliable reader
+that joins messages of more than 64 KB midway, about once in 150 starts, with more shared memory once in 10.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEve
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
 
-from garps_ros.live.arrivals import MANY_MISSING, Arrivals
-from garps_ros.live.health import InputState
+from garps_ros.live.arrivals import MANY_MISSING, Arrivals, InputState
 
 QUEUE = 10
-"""Messages that wait for the executor; at 30 Hz a third of a second."""
+"""Number of messages that wait for the executor; a third of a second at 30 Hz."""
 NOTHING_S = 3.0
-"""When nothing has come for so long from publishers that are there, it is being lost."""
+"""Time without any message from publishers that are there after which messages count as lost, s."""
 
 
 class Input:
@@ -37,7 +36,7 @@ class Input:
         received: called with every message.
         say: called with a line when QoS does not match.
         once: one message is enough (a calibration); then a latched one is asked for where it is offered.
-        optional: nothing is wrong when nothing comes.
+        optional: its absence is no error.
     """
 
     def __init__(
@@ -59,17 +58,17 @@ class Input:
         self.arrivals = Arrivals()
         self._publishers = 0
         self._offered_since_s: float | None = None
-        self._problem = ""
+        self._warning = ""
         # Until a publisher is there: best effort hears everyone.
         self._qos = _profile(reliability == "reliable", latched=False)
         self._subscription = self._subscribe()
 
     def follow_offers(self) -> None:
-        """Look at the publishers; subscribe anew where another QoS suits them better. Cheap: call it often."""
+        """Subscribe anew where another QoS suits the publishers better. It is cheap and may be called often."""
         # By the name before remapping: rclpy remaps it here too, and would remap a remapped one once more.
         offers = self._node.get_publishers_info_by_topic(self._topic)
         self._publishers = len(offers)
-        self._problem = self._type_problem(offers) or self._qos_problem(offers)
+        self._warning = self._type_warning(offers) or self._qos_warning(offers)
         if not offers:
             return
         offered = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
@@ -82,7 +81,7 @@ class Input:
             self._subscription = self._subscribe()
 
     def _needs_it(self) -> bool:
-        """Whether best effort is not enough: a calibration must not be lost, and images are being lost."""
+        """Tell whether best effort is not enough: a calibration must not be lost, or images are being lost."""
         if self._once or self._qos.reliability == ReliabilityPolicy.RELIABLE:
             return True
         now_s = time.monotonic()
@@ -91,10 +90,10 @@ class Input:
         return never or self.arrivals.missing() > MANY_MISSING
 
     def state(self) -> InputState:
-        """For the diagnostics."""
+        """Return the state for the diagnostics."""
         qos = self._qos.reliability.name + (", TRANSIENT_LOCAL" if _is_latched(self._qos) else "")
         return InputState(
-            self._role, self.topic, self.arrivals, self._publishers, qos, self._problem, self._once, self._optional
+            self._role, self.topic, self.arrivals, self._publishers, qos, self._warning, self._once, self._optional
         )
 
     def _subscribe(self) -> Any:
@@ -116,14 +115,14 @@ class Input:
             f"for ({event.total_count} so far): nothing will arrive from it; set image_qos to auto or best_effort"
         )
 
-    def _qos_problem(self, offers: list[Any]) -> str:
+    def _qos_warning(self, offers: list[Any]) -> str:
         asked = self._qos.reliability == ReliabilityPolicy.RELIABLE and self._reliability == "reliable"
         weak = [offer for offer in offers if offer.qos_profile.reliability != ReliabilityPolicy.RELIABLE]
         if not (asked and weak):
             return ""
         return f"incompatible QoS: {weak[0].node_name} offers BEST_EFFORT, image_qos asks for RELIABLE; set it to auto"
 
-    def _type_problem(self, offers: list[Any]) -> str:
+    def _type_warning(self, offers: list[Any]) -> str:
         package, kind = self._kind.__module__.split(".")[0], self._kind.__name__
         wanted = f"{package}/msg/{kind}"
         others = [offer for offer in offers if offer.topic_type != wanted]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose as a transform on /tf, when asked for: only if nobody else says where the camera is."""
+"""The pose as a transform on /tf, published only if nobody else publishes where the camera is."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ QOS = QoSProfile(depth=100)  # as tf2_ros
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MOST_FRAMES = 10_000
 RECENT = 1000
-"""Transforms sent here of which the echo on /tf may still be under way; queues hold 100."""
+"""Number of transforms kept whose echo on /tf may still be under way; queues hold 100."""
 
 
 class Transforms:
@@ -26,7 +26,7 @@ class Transforms:
     Args:
         node: to publish with.
         poses: makes the messages.
-        say: called with a line when a transform is refused.
+        say: called with a line when a transform is not published.
     Raises:
         ImportError: tf2_msgs is not installed.
     """
@@ -35,15 +35,15 @@ class Transforms:
         kind = importlib.import_module("tf2_msgs.msg").TFMessage  # part of ROS, but not of every installation
         self._message, self._poses, self._say = kind, poses, say
         self._parents: dict[str, str] = {}
-        """As others have told: child -> parent."""
+        """Child -> parent, as others have published."""
         self._sent: dict[tuple[str, str, int], None] = {}
-        """Parent, child and stamp (ns) of what was sent from here, oldest first; it comes back on /tf."""
+        """Parent, child and stamp (ns) of the transforms sent from here, oldest first; they come back on /tf."""
         self._publisher = node.create_publisher(kind, "/tf", QOS)
         node.create_subscription(kind, "/tf", self._heard, QOS)
         node.create_subscription(kind, "/tf_static", self._heard_static, STATIC_QOS)
 
     def send(self, T: Float64Array, stamp_ns: int, frame_id: str, child_frame_id: str) -> str:
-        """Publish T (4x4, m) as frame_id -> child_frame_id; returns why not, "" when it was."""
+        """Publish T (4x4, m) as frame_id -> child_frame_id; return "" or the reason why it is not published."""
         reason = self._objection(frame_id, child_frame_id)
         if reason:
             self._say(reason)
@@ -54,7 +54,7 @@ class Transforms:
         return ""
 
     def _objection(self, frame_id: str, child: str) -> str:
-        """Why the transform would break the tree; "" when it would not.
+        """Return why the transform would break the tree; "" when it would not.
 
         A parent of the same name is no better than another one: two answers to where the child is.
         """
@@ -68,7 +68,7 @@ class Transforms:
         return f"{why}: not published with the parent {frame_id}; set source_frame to another name"
 
     def _upwards(self, frame_id: str) -> list[str]:
-        """A frame, its parent, the parent's parent and so on, as far as others have told."""
+        """Return a frame, its parent, the parent's parent and so on, as far as others have published."""
         chain = [frame_id]
         while (parent := self._parents.get(chain[-1])) is not None and parent not in chain:
             chain.append(parent)

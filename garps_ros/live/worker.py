@@ -34,11 +34,11 @@ class Worker(Generic[Job, Result]):
         self._busy_since: float | None = None
         self._results: deque[Result] = deque()
         self.min_period_s = 0.0
-        """Jobs begin at least this far apart, s; a change counts from the next offer on."""
+        """Shortest time between the starts of two jobs, s; a change counts from the next offer on."""
         self.death = ""
-        """Why the thread ended although nobody stopped it; empty while it lives."""
+        """Reason why the thread ended although nobody stopped it; "" while it lives."""
         self.error: BaseException | None = None
-        """What it ended by."""
+        """The exception that ended the thread."""
         self.prepared = prepare is None
         """The thread takes jobs."""
         self._begin()
@@ -57,7 +57,7 @@ class Worker(Generic[Job, Result]):
         return waited
 
     def take(self) -> list[Result]:
-        """The results since the last call, oldest first."""
+        """Return the results since the last call, oldest first."""
         results = []
         while self._results:
             results.append(self._results.popleft())
@@ -65,12 +65,12 @@ class Worker(Generic[Job, Result]):
 
     @property
     def busy_s(self) -> float:
-        """How long the present job has been running, s; 0 when idle."""
+        """Time that the present job has been running, s; 0 when idle."""
         since = self._busy_since
         return 0.0 if since is None else time.monotonic() - since
 
     def restart(self) -> None:
-        """A new thread after `death`."""
+        """Start a new thread after `death`."""
         self.death, self.error, self._busy_since = "", None, None
         self._begin()
 
@@ -113,7 +113,7 @@ class Worker(Generic[Job, Result]):
             self._finished()
 
     def _next(self, begun_s: float) -> Job | None:
-        """The newest job, `min_period_s` after the one before has begun; None when stopped."""
+        """Wait for a job; return the newest, `min_period_s` after the last has begun, or None when stopped."""
         with self._changed:
             while not self._stopped:
                 due_in = begun_s + self.min_period_s - time.monotonic()

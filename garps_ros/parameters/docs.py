@@ -8,27 +8,31 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import groupby
 from pathlib import Path
 
 from garps_core.config import PRESETS
-from garps_ros.parameters.parameter import Parameter, Value, parameters
+from garps_ros.parameters.parameter import Parameter, Value, expert_settings, parameters
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
 GROUPS = {
-    "node": ("The node", "What is subscribed, paired and published."),
-    "reconstruction": ("`reconstruction`", "What turns a view into a mixture, and which weights networks use."),
-    "lifting": ("`lifting`", "How a pixel with depth becomes a Gaussian: the sensor model."),
-    "start": ("`start`", "Where the alignment starts."),
-    "alignment": ("`alignment`", "The objective and how it is maximised; what a pose must hold to be published."),
-    "": ("The estimator as a whole", "Where and in which arithmetic it runs."),
+    "node": ("The node", "Subscriptions, pairing and publishing."),
+    "reconstruction": ("`reconstruction`", "Where depth comes from, and which weights networks use."),
+    "lifting": ("`lifting`", "The sensor model: how a pixel with depth becomes a Gaussian."),
+    "start": ("`start`", "The pose that an alignment begins from."),
+    "alignment": ("`alignment`", "The objective, how it is maximised, and what a pose must fulfil."),
+    "paper": ("`paper`", "The published method, used where `method` is paper."),
+    "": ("The estimator as a whole", "Device, arithmetic and random numbers."),
 }
 OTHER_PRESETS = tuple(name for name in PRESETS if name not in ("default", "sensor"))
 INDENT = " " * 4
+WIDTH = 120
+"""Longest line of config/garps.yaml."""
 
 INTRODUCTION = """\
 # Parameters of the live node
@@ -36,12 +40,12 @@ INTRODUCTION = """\
 Generated from the settings in `garps_ros/parameters/settings.py` and `garps_core/config/`; change those, then run
 `python -m garps_ros.parameters.docs`.
 
-`pose_node` has two kinds of parameters: its own, and every setting of the estimator under the name it has everywhere
-else (`lifting.stride` here is `--set lifting.stride=4` of `garps-replay`). `preset` chooses the values that the
-estimator's settings start from: `default` and `sensor` (the same today) for measured depth, `time_of_flight`,
-`structured_light` and `stereo` for depth of that kind, `monocular` for a network's depth, `paper` for the published
-method. A single setting given beside it stands above the preset. The annealing ladders are tables and no parameters;
-they come with the preset.
+`pose_node` has two kinds of parameters: its own, and the settings of the estimator that a robot needs, under the name
+they have everywhere else (`lifting.stride` here is `--set lifting.stride=4` of `garps-replay`). `preset` chooses the
+values that the estimator's settings start from: `default` and `sensor` (the same today) for measured depth,
+`time_of_flight`, `structured_light` and `stereo` for depth of that kind, `monocular` for a network's depth, `paper` for
+the published method. All other settings are [expert settings](#expert-settings); the node takes them from a settings
+file.
 
 ## Setting them
 
@@ -57,7 +61,7 @@ In a file, of which `config/garps.yaml` is one with everything in it:
 
 ```bash
 ros2 run garps_ros pose_node --ros-args --params-file my.yaml
-ros2 run garps_ros pose_node --ros-args -p pairing:=keyframe -p lifting.max_range_m:=5.0 -p rectified:="'true'"
+ros2 run garps_ros pose_node --ros-args -p pairing:=keyframe -p lifting.max_range_m:=5.0 -p rectified:=rectified
 ros2 param set /pose_node lifting.stride 4
 ros2 param describe /pose_node lifting.stride
 ```
@@ -65,60 +69,91 @@ ros2 param describe /pose_node lifting.stride
 In a Python launch file: `Node(package="garps_ros", executable="pose_node", parameters=["my.yaml", {"sync_slop":
 0.03}])`; what comes later stands above what came before.
 
-**Types.** ROS takes `5` for an integer and refuses it for a double: write `5.0`. It takes `true` for a bool and
-refuses it for a string: `rectified` needs quotes, `"true"` in a file and `"'true'"` in a shell.
+**Types.** ROS takes `5` for an integer and refuses it for a double: write `5.0`.
 
-**Mistakes.** A wrong type, a value out of range or a misspelt name at the start is one line, and the node does not
-start. A name unlike all of these is taken for another node's and noted in the log. While the node runs, a wrong
-change is refused with its reason and nothing is changed; several parameters that are set together change together or
-not at all.
+**Mistakes.** A wrong type, a value out of range, a misspelt name or an expert setting at the start is one line, and the
+node does not start. A name unlike all of these is taken for another node's and noted in the log. While the node runs, a
+wrong change is refused with its reason and nothing is changed; several parameters that are set together change together
+or not at all.
 
-**Live.** What is live may be changed while the node runs (`ros2 param set`) and holds from the next pair on; the rest
-is fixed at the start.
+**Live.** Live parameters may be changed while the node runs (`ros2 param set`) and hold from the next pair on; the
+others are fixed at the start.
+
+**Old names.** A setting that was renamed works under its old name for one release, with a warning that gives the new
+one.
+"""
+
+EXPERTS = """\
+## Expert settings
+
+Only somebody who tunes the algorithm needs these. They are no ROS parameters. Set one by `--set NAME=VALUE` of
+`garps align` and `garps-replay`, by `config.replace({"NAME": value})` in Python, or for the node in a settings file:
+
+```text
+# my_settings.yaml, with names of this page and without `ros__parameters`
+alignment.max_distance_m: 1.5
+start.max_features: 1000
+```
+
+```bash
+garps align a.png b.png --K 525 525 319.5 239.5 --settings my_settings.yaml
+ros2 run garps_ros pose_node --ros-args -p settings_file:=my_settings.yaml
+```
+
+The file may hold every setting of the estimator, and `preset: NAME`. A preset that is given beside the file stands
+above the file's, with a note; a single setting stands above it too. The annealing ladders are tables and come with the
+preset.
 """
 
 FILE_HEAD = """\
 # SPDX-License-Identifier: Apache-2.0
-# Every parameter of pose_node with its default: meaning [range, unit]. Generated: python -m garps_ros.parameters.docs
-# A double needs its point (5.0, never 5); text that looks like something else needs quotes ("true").
-# The estimator's settings are commented out (#name) so that `preset` decides them; without its # one stands above it.
+# Parameters of pose_node with their defaults; docs/parameters.md says all about them. Generated by
+# python -m garps_ros.parameters.docs. `preset` decides lines that begin with #name; without the # they stand above it.
 /**:
   ros__parameters:
 """
 
 
 def page() -> str:
-    """The text of docs/parameters.md."""
-    others = {preset: {p.name: p.default for p in parameters(preset)} for preset in OTHER_PRESETS}
-    lines = [INTRODUCTION]
-    for group, members in groupby(parameters(), key=lambda parameter: parameter.group):
-        title, meaning = GROUPS[group]
-        lines += [f"## {title}\n", meaning + "\n"]
-        lines += [
-            "| name | type | default | range or choices | unit | live | meaning |",
-            "|---|---|---|---|---|---|---|",
-        ]
-        for parameter in members:
-            presets = {} if group == "node" else {preset: values[parameter.name] for preset, values in others.items()}
-            lines.append(_row(parameter, presets))
-        lines.append("")
+    """Return the text of docs/parameters.md."""
+    lines = [INTRODUCTION, *_tables(parameters, "##", "name type default limits unit live meaning")]
+    lines += [EXPERTS, *_tables(expert_settings, "###", "name default limits unit meaning")]
     return "\n".join(lines)
 
 
-def _row(parameter: Parameter, presets: dict[str, Value]) -> str:
+def _tables(settings: Callable[[str], list[Parameter]], level: str, columns: str) -> Iterator[str]:
+    """Yield the lines of one table for each group of settings.
+
+    Args:
+        settings: preset -> settings with its values as defaults.
+        level: mark of a heading.
+        columns: the cells of a row, in order.
+    """
+    others = {preset: {p.name: p.default for p in settings(preset)} for preset in OTHER_PRESETS}
+    for group, members in groupby(settings("default"), key=lambda parameter: parameter.group):
+        title, meaning = GROUPS[group]
+        yield from (f"{level} {title}\n", meaning + "\n")
+        yield "| " + " | ".join("range or choices" if name == "limits" else name for name in columns.split()) + " |"
+        yield "|" + "---|" * len(columns.split())
+        for parameter in members:
+            presets = {} if group == "node" else {preset: values[parameter.name] for preset, values in others.items()}
+            cells = _cells(parameter, presets)
+            yield "| " + " | ".join(cells[name] for name in columns.split()) + " |"
+        yield ""
+
+
+def _cells(parameter: Parameter, presets: dict[str, Value]) -> dict[str, str]:
     defaults = [f"`{written(parameter.default)}`"]
     defaults += [f"{name} `{written(value)}`" for name, value in presets.items() if value != parameter.default]
-    limits = ", ".join(f"`{choice}`" for choice in parameter.choices) or _range(parameter)
-    cells = [
-        f"`{parameter.name}`",
-        TYPES[type(parameter.default)],
-        "; ".join(defaults),
-        limits,
-        parameter.unit,
-        "yes" if parameter.live else "no",
-        parameter.doc,
-    ]
-    return "| " + " | ".join(cells) + " |"
+    return {
+        "name": f"`{parameter.name}`",
+        "type": TYPES[type(parameter.default)],
+        "default": "; ".join(defaults),
+        "limits": ", ".join(f"`{choice}`" for choice in parameter.choices) or _range(parameter),
+        "unit": parameter.unit,
+        "live": "yes" if parameter.live else "no",
+        "meaning": parameter.doc,
+    }
 
 
 def _range(parameter: Parameter) -> str:
@@ -129,7 +164,7 @@ def _range(parameter: Parameter) -> str:
 
 
 def written(value: Value) -> str:
-    """A value as YAML that keeps its type, for ROS and for PyYAML alike (which takes 1e-05 for text, 1.0e-05 not)."""
+    """Return a value as YAML that keeps its type, for ROS and for PyYAML alike; PyYAML takes 1e-05 for text."""
     if isinstance(value, float):
         mantissa, e, exponent = repr(value).partition("e")
         return mantissa + (".0" if e and "." not in mantissa else "") + e + exponent
@@ -137,24 +172,18 @@ def written(value: Value) -> str:
 
 
 def yaml_file() -> str:
-    """The text of config/garps.yaml: the node's parameters with their defaults, the estimator's commented out."""
-    lines = [FILE_HEAD.rstrip()]
-    for group, members in groupby(parameters(), key=lambda parameter: parameter.group):
-        title, meaning = GROUPS[group]
-        lines.append(f"\n{INDENT}# ---- {title.replace('`', '')}: {meaning}")
-        for parameter in members:
-            lines += _entry(parameter)
-    return "\n".join(lines) + "\n"
+    """Return the text of config/garps.yaml: a line for each parameter, the estimator's commented out."""
+    return FILE_HEAD + "".join(_entry(parameter) + "\n" for parameter in parameters())
 
 
-def _entry(parameter: Parameter) -> Iterator[str]:
-    limits = ", ".join(parameter.choices) or _range(parameter)
-    brackets = " ".join(word for word in (limits, parameter.unit) if word)
-    fixed = "" if parameter.live else " (fixed at the start)"
-    meaning = parameter.doc + (f" [{brackets}]" if brackets else "") + fixed
-    yield from textwrap.wrap(meaning, 120, initial_indent=f"{INDENT}# ", subsequent_indent=f"{INDENT}#   ")
+def _entry(parameter: Parameter) -> str:
+    """Return one line: name, value and the first clause of the meaning, with unit or choices."""
     mark = "" if parameter.group == "node" else "#"
-    yield f"{INDENT}{mark}{parameter.name}: {written(parameter.default)}"
+    line = f"{INDENT}{mark}{parameter.name}: {written(parameter.default)}  # "
+    limits = " | ".join(parameter.choices) or parameter.unit
+    clause = re.split("[;:,]", parameter.doc)[0]
+    comment = f"{clause} [{limits}]" if limits else clause
+    return line + textwrap.shorten(comment, WIDTH - len(line), placeholder=" ...")
 
 
 def main(arguments: list[str] | None = None) -> int:

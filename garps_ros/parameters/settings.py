@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live node's own settings: what is subscribed, paired and published. The estimator's are `garps_core.Config`."""
+"""The live node's own settings: subscriptions, pairing, publishing. The estimator's are `garps_core.Config`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,22 @@ from dataclasses import dataclass
 
 from garps_core.config import PRESETS
 from garps_core.config.field import Checked, setting
+from garps_core.config.renamed import warn_once
 from garps_core.errors import ConfigError
+
+RECTIFIED = ("auto", "rectified", "raw")
+"""Answers to whether images are rectified."""
+OLD_RECTIFIED = {"true": "rectified", "false": "raw"}
+"""Earlier words for the same, which work for one release."""
+
+
+def current_rectified(value: str) -> str:
+    """Return the present word for a value of `rectified`; the first use of an earlier one is a warning in the log."""
+    word = value.lower()
+    if word not in OLD_RECTIFIED:
+        return value
+    warn_once(f"rectified={word}", f"rectified={OLD_RECTIFIED[word]}")
+    return OLD_RECTIFIED[word]
 
 
 @dataclass(frozen=True)
@@ -16,72 +31,102 @@ class NodeSettings(Checked, prefix=""):
 
     preset: str = setting(
         "default",
-        "the estimator's settings to start from",
+        "preset that the estimator's settings start from",
         choices=tuple(PRESETS),
+        live=False,
+    )
+    settings_file: str = setting(
+        "",
+        "path of a YAML file with settings of the estimator, expert settings too; parameters stand above it; empty = "
+        "none",
         live=False,
     )
     pairing: str = setting(
         "cameras",
-        "cameras = two cameras, images of the same time; keyframe = the source camera alone, against its keyframe",
+        "pairs to estimate: cameras = images of two cameras at the same time, keyframe = the source camera alone, "
+        "against its keyframe",
         choices=("cameras", "keyframe"),
         live=False,
     )
     image_transport: str = setting(
-        "raw", "of the images; compressed = topic + /compressed", choices=("raw", "compressed"), live=False
+        "raw",
+        "transport of the images; compressed = subscribe to the topic + /compressed",
+        choices=("raw", "compressed"),
+        live=False,
     )
     depth_transport: str = setting(
         "raw",
-        "of the depth; otherwise topic + / + this",
+        "transport of the depth; if not raw, its name is added to the topic after a /",
         choices=("raw", "compressed", "compressedDepth"),
         live=False,
     )
     image_qos: str = setting(
         "auto",
-        "reliability of the image subscriptions; auto = best effort, reliable where images get lost and it is offered",
+        "reliability of the image subscriptions; auto = best effort, or reliable where images get lost and it is "
+        "offered",
         choices=("auto", "reliable", "best_effort"),
         live=False,
     )
-    publish_tf: bool = setting(False, "also publish the pose as a transform", live=False)
+    publish_tf: bool = setting(False, "publish the pose as a transform too", live=False)
     rectified: str = setting(
         "auto",
-        "are the images rectified? auto = by topic name; true = use P; false = use K and D",
-        choices=("auto", "true", "false"),
+        "kind of the images: rectified = P of their CameraInfo counts, raw = its K and D count, auto = by the topic's "
+        "name",
+        choices=RECTIFIED,
     )
-    allow_resized: bool = setting(False, "accept images whose size is that of their CameraInfo, scaled evenly")
+    allow_resized: bool = setting(
+        False, "accept images of another size than their CameraInfo, if both sides are scaled alike"
+    )
     sync_slop: float = setting(
-        0.02, "largest difference of stamps that belong together; equal stamps always pair", unit="s", low=0, high=10
+        0.02,
+        "largest difference of stamps that belong together; equal stamps always pair",
+        unit="s",
+        low=0,
+        high=10,
     )
-    keyframe_overlap: float = setting(0.5, "new keyframe when the overlap falls below", low=0, high=1)
-    keyframe_motion: float = setting(0.3, "new keyframe beyond this distance", unit="m", low=0, high=1000)
-    keyframe_rotation: float = setting(20.0, "new keyframe beyond this rotation", unit="deg", low=0, high=180)
+    keyframe_overlap: float = setting(
+        0.5, "smallest overlap with the keyframe; below it a new one is taken", low=0, high=1
+    )
+    keyframe_motion: float = setting(
+        0.3, "largest distance from the keyframe; beyond it a new one is taken", unit="m", low=0, high=1000
+    )
+    keyframe_rotation: float = setting(
+        20.0, "largest rotation from the keyframe; beyond it a new one is taken", unit="deg", low=0, high=180
+    )
     keyframe_lost_after: int = setting(
-        5, "a new trajectory begins after so many frames in a row without a pose", unit="frames", low=1, high=1000
+        5,
+        "number of frames in a row without a pose after which a new trajectory begins",
+        unit="frames",
+        low=1,
+        high=1000,
     )
-    source_frame: str = setting("", "name to publish instead of the frame_id of the source images")
-    target_frame: str = setting("", "name to publish instead of the frame_id of the target images")
-    lazy: bool = setting(True, "compute only while somebody subscribes to a result; keyframe pairing always computes")
+    source_frame: str = setting("", "frame name of the source camera; empty = frame_id of the source images")
+    target_frame: str = setting("", "frame name of the target camera; empty = frame_id of the target images")
+    lazy: bool = setting(
+        True, "compute only while somebody subscribes to a result; with keyframe pairing the node always computes"
+    )
     max_rate: float = setting(
-        0.0, "most pairs per second, 0 = as fast as the machine allows", unit="Hz", low=0, high=1000
+        0.0, "largest number of pairs per second, 0 = as many as the machine manages", unit="Hz", low=0, high=1000
     )
     prior_max_age: float = setting(
         0.1,
-        "a prior whose stamp differs more from the source image's is not used, for its covariance is taken as it is, "
-        "however far the camera has moved since; one with zero stamp always is used",
+        "largest difference of stamps between a prior and the source image; an older prior is not used, because its "
+        "covariance does not cover the motion since; a prior with stamp zero is always used",
         unit="s",
         low=0,
         high=1e6,
     )
     input_timeout: float = setting(
-        5.0, "an input silent for longer is reported as an error", unit="s", low=0.1, high=3600
+        5.0, "longest silence of an input before diagnostics report an error", unit="s", low=0.1, high=3600
     )
     stage_timeout: float = setting(
-        10.0, "a computation that takes longer is reported as stuck", unit="s", low=0.1, high=3600
+        10.0, "longest computation before diagnostics report it as stuck", unit="s", low=0.1, high=3600
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.source_frame and self.source_frame == self.target_frame:
             raise ConfigError(
-                f"source_frame and target_frame are both {self.source_frame!r}: expected two names, for the pose is of "
-                "the one in the other; change one, or leave it empty for the frame_id of the images"
+                f"source_frame and target_frame are both {self.source_frame!r}: expected two names, because the pose "
+                "is that of one in the other. Change one, or leave it empty for the frame_id of the images"
             )

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings -> frames; estimates -> files."""
+"""Recordings -> frames (`bags`, `topics`, `frame_reader`), results -> files (`session`, `outputs`), and `playback`."""

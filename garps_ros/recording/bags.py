@@ -12,7 +12,7 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from garps_ros.recording.truncated import salvageable
+from garps_ros.recording.cut_mcap import salvageable
 from msg_adapters import MessageError
 
 
@@ -35,7 +35,7 @@ class Bag:
         """Message type by topic, e.g. "sensor_msgs/msg/Image", of the topics that hold messages."""
         self.counts: dict[str, int] = {}
         self.broken_end = ""
-        """Why reading stopped before the end; empty when it did not."""
+        """Reason why reading stopped before the end; "" when it did not."""
         self._stack = ExitStack()
         self._first: dict[str, Any] = {}
 
@@ -75,14 +75,14 @@ class Bag:
         self._stack.close()
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic that can be decoded, or None."""
+        """Return the first message of a topic that can be decoded, or None."""
         if topic not in self._first:
             decoded = (message for _, message in self.messages([topic]) if not isinstance(message, MessageError))
             self._first[topic] = next(decoded, None)
         return self._first[topic]
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-        """All messages of some topics in order of recording as (topic, message).
+        """Yield all messages of some topics in order of recording as (topic, message).
 
         A message that cannot be decoded comes as the MessageError that says why. When the file breaks off, the
         iteration ends and `broken_end` says why.
@@ -91,7 +91,7 @@ class Bag:
             yield connection.topic, self._decoded(raw, connection.msgtype)
 
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Any, int, Any]]:
-        """(connection, recording time ns, raw message) of some topics, as far as the file is whole."""
+        """Yield (connection, recording time ns, raw message) of some topics, as far as the file is whole."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         records = self._reader.messages(connections=connections) if connections else iter(())
         while True:
@@ -105,7 +105,7 @@ class Bag:
             yield record
 
     def listing(self) -> str:
-        """The topics with their types, for error texts."""
+        """Return the topics with their types, for error texts."""
         return "; ".join(f"{name} ({kind}, {self.counts[name]})" for name, kind in sorted(self.types.items()))
 
     def _decoded(self, raw: bytes, kind: str) -> Any:

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the messages of a recording to frames (image + depth + camera_info) and to pairs of frames of two cameras."""
+"""Messages of a recording -> frames (image, depth, camera_info) -> pairs of frames of two cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
+from garps_ros.frames.frame import CameraTopics, Frame
 from garps_ros.recording.bags import Bag
 from msg_adapters import MessageError
 
 INFO = 2
 
 Refused = Callable[[str], None]
-"""Called with the reason when a message cannot be used at all."""
+"""A function called with the reason when a message cannot be used at all."""
 
 
 class Frames:
@@ -31,12 +31,12 @@ class Frames:
         self._assembly = Assembly(cameras, slop_ns, lambda topic, reason: refused(f"{topic}: {reason}"))
 
     def singles(self) -> Iterator[Frame]:
-        """The frames of the only camera."""
+        """Yield the frames of the only camera."""
         for (frame,) in self._complete():
             yield frame
 
     def pairs(self) -> Iterator[tuple[Frame, Frame]]:
-        """Frames of both cameras whose stamps agree to the slop, as (first camera, second camera)."""
+        """Yield the frames of both cameras whose stamps agree to the slop, as (first camera, second camera)."""
         yield from ((first, second) for first, second in self._complete())
 
     def unpaired(self) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a replay leaves behind: trajectory.tum and poses.csv, written row by row, and a rosbag2, valid once closed.
+"""The results of a replay: trajectory.tum and poses.csv, written row by row, and a rosbag2, valid once closed.
 
 Nothing in them depends on the time or place of the run: the same recording and settings give the same bytes.
 """

@@ -35,18 +35,18 @@ from msg_adapters import NANOSECONDS
 
 INTERRUPTED = 130
 TICK_S = 0.008
-"""Wall time between two /clock messages: 100 Hz, with room for a coarse timer."""
+"""Wall time between two /clock messages, s: 100 Hz, with room for a coarse timer."""
 LEAD_S = 0.1
-"""Wall time that /clock runs before the first message."""
+"""Wall time that /clock runs before the first message, s."""
 LATE_S = 0.2
-"""Wall time behind the recording from which on it is said."""
+"""Wall time behind the recording from which on a line is written, s."""
 SETTLE_S = 0.6
-"""How long nothing may be added before the listeners count as complete: subscriptions are matched one after another,
+"""Time without a new subscription after which the listeners count as complete, s: they are matched one after another,
 and `pose_node`, which looks at the publishers every 0.2 s, then subscribes anew with the QoS that they offer."""
 PATIENCE_S = 3.0
-"""The same while the graph shows more subscriptions than are matched; some never are, for their QoS."""
+"""That time while the graph shows more subscriptions than are matched, s; some never are, because of their QoS."""
 DELIVERY_S = 5.0
-"""How long slow subscribers may take to acknowledge the last messages."""
+"""Time that slow subscribers may take to acknowledge the last messages, s."""
 
 # What rclpy and rclcpp subscribe /clock with, and what rosbag2 offers.
 CLOCK_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -54,7 +54,7 @@ Say = Callable[[str], None]
 
 
 def play(path: Path, rate: float, loop: bool, topics: list[str], wait_s: float) -> int:
-    """Play a recording; returns the exit code: 0 = to its end, 1 = no message could be sent, 130 = interrupted.
+    """Play a recording; return the exit code: 0 = to its end, 1 = no message could be sent, 130 = interrupted.
 
     Args:
         path: the recording, see `Bag`.
@@ -93,7 +93,7 @@ def play(path: Path, rate: float, loop: bool, topics: list[str], wait_s: float) 
 
 @contextmanager
 def _node() -> Iterator[Node]:
-    """A node of its own context; signals stay with the caller, so that nothing is torn down under a publisher."""
+    """Make a node with its own context; signals stay with the caller, so that no publisher is torn down in use."""
     context = Context()
     try:
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -111,7 +111,7 @@ def _node() -> Iterator[Node]:
 
 
 class Timeline:
-    """Recording time against the steady clock: no drift, whatever single sleeps do.
+    """The recording time that is due, by the steady clock: single sleeps do not add up to a drift.
 
     Args:
         first_ns: recording time of the first message, which is due `LEAD_S` from now.
@@ -123,11 +123,11 @@ class Timeline:
         self._due_ns = time.monotonic_ns() + round(LEAD_S * NANOSECONDS)
 
     def now_ns(self) -> int:
-        """The recording time that it is now."""
+        """Return the recording time that is due now, ns."""
         return self._first_ns + round((time.monotonic_ns() - self._due_ns) * self._rate)
 
     def remaining_s(self, recording_ns: int) -> float:
-        """Wall time until a recording time is due, seconds; negative when it has passed."""
+        """Return the wall time until a recording time is due, s; negative when it has passed."""
         return (recording_ns - self.now_ns()) / self._rate / NANOSECONDS
 
 
@@ -180,7 +180,7 @@ class Player:
             self._say(self._listeners() if heard else "nobody listens to an image: playing all the same")
 
     def _settling_s(self, matched: int) -> float:
-        """How long nothing must have been added: longer while somebody is known to subscribe and not yet matched."""
+        """Return the time without a new subscription to wait for, s; longer while a known one is not yet matched."""
         known = sum(self._node.count_subscribers(topic) for topic in self._routes)
         return SETTLE_S if matched >= known else PATIENCE_S
 
@@ -262,7 +262,7 @@ class Player:
 
 
 def _summary(routes: dict[str, Route], broken_end: str) -> Table:
-    """Messages by topic, and what went wrong."""
+    """Return a table of the messages by topic, with the reasons of those refused."""
     table = Table(title="Played")
     for heading, justify in (("topic", "left"), ("type", "left"), ("messages", "right")):
         table.add_column(heading, justify=justify, overflow="fold")  # type: ignore[arg-type]

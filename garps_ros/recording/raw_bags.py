@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording's messages undecoded, as ROS 2 would have them on the wire."""
+"""The messages of a recording as they are sent by ROS 2, serialised (CDR)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RawBag(Bag):
         return self
 
     def raw_messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes | MessageError]]:
-        """All messages of some topics in order of recording as (topic, recording time ns, CDR).
+        """Yield all messages of some topics in order of recording as (topic, recording time ns, CDR).
 
         A ROS 1 message that cannot be rewritten comes as the MessageError that says why. When the file breaks off, the
         iteration ends and `broken_end` says why.
@@ -38,7 +38,7 @@ class RawBag(Bag):
         return int(self._reader.end_time or 0)
 
     def latched(self, topic: str) -> int:
-        """How many messages of a topic late subscribers were given when it was recorded; 0 for none."""
+        """Return the number of messages of a topic that late subscribers got when it was recorded."""
         count = 0
         for connection in self._reader.connections:
             if connection.topic != topic:
@@ -51,7 +51,7 @@ class RawBag(Bag):
         return count
 
     def _rewriter(self) -> Callable[[Any, str], bytes | MessageError]:
-        """From ROS 1's serialisation to CDR, with the header of ROS 2: rosbags passes over `seq` if it is undefined."""
+        """Return a function from ROS 1's serialisation to CDR; with ROS 2's header rosbags leaves out `seq`."""
         store = get_typestore(Stores.EMPTY)
         header = get_typestore(Stores.ROS2_JAZZY).fielddefs[HEADER]
         store.register({**self._reader.typestore.fielddefs, HEADER: header})
@@ -66,5 +66,5 @@ class RawBag(Bag):
 
 
 def bytes_of(raw: Any, _: str) -> bytes:
-    """What rclpy publishes unchanged: bytes, not a view of them."""
+    """Copy a buffer: rclpy publishes bytes, but no view of them."""
     return bytes(raw)

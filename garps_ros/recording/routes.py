@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the messages of a recording go in a live graph: a publisher per topic. Needs rclpy."""
+"""The publishers of a recording's topics in a live graph. Needs rclpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from msg_adapters import MessageError
 
 CLOCK_TOPIC = "/clock"
 DEPTH, LARGEST_DEPTH = 10, 1000
-"""Messages a publisher keeps; more where a recording's publishers together kept more for late subscribers."""
+"""Number of messages that a publisher keeps; more if the recorded publishers kept more for late subscribers."""
 KIND = re.compile(r"([a-zA-Z]\w*)/msg/([A-Z]\w*)")
 
 
@@ -43,9 +43,9 @@ class Route:
     sent: int = 0
     refused: int = 0
     reason: str = ""
-    """Why the first message was refused."""
+    """Reason why the first message was refused."""
     fits: bool = False
-    """One message was decoded as the installed type."""
+    """A message has been decoded as the installed type."""
 
     def send(self, raw: bytes | MessageError) -> None:
         """Publish a serialised message, or count it as refused.
@@ -72,16 +72,16 @@ class Route:
         return "" if padded else f"{wrong}: {len(raw)} bytes, expected {size}"
 
     def listeners(self) -> int:
-        """Subscriptions that are matched now."""
+        """Return the number of subscriptions that are matched now."""
         return int(self.publisher.get_subscription_count())
 
     def delivered(self, timeout: Duration) -> bool:
-        """Whether all subscribers have acknowledged everything, waiting for so long."""
+        """Wait until all subscribers have acknowledged everything; False after the timeout."""
         return bool(self.publisher.wait_for_all_acked(timeout))
 
 
 def open_routes(node: Node, bag: RawBag, topics: list[str]) -> tuple[dict[str, Route], dict[str, str]]:
-    """Publishers of the topics that can be played, and why the others cannot.
+    """Open publishers of the topics that can be played; return also why the others cannot.
 
     Args:
         node: the publishers' node.
@@ -109,7 +109,7 @@ def open_routes(node: Node, bag: RawBag, topics: list[str]) -> tuple[dict[str, R
 
 
 def _open(node: Node, bag: RawBag, topic: str) -> Route | str:
-    """A route, or why there can be none."""
+    """Open a route, or return why there can be none."""
     kind = bag.types[topic]
     if topic == CLOCK_TOPIC:
         return "the clock is made from the recording times"
@@ -130,7 +130,7 @@ def _open(node: Node, bag: RawBag, topic: str) -> Route | str:
 
 
 def _message_class(kind: str) -> Any:
-    """The class of a message type, None when its package is not installed or has no such message."""
+    """Return the class of a message type, None when its package is not installed or has no such message."""
     match = KIND.fullmatch(kind)
     if match is None:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the outcomes of a replay, counts them, and stops in time."""
+"""The writing and counting of a replay's outcomes, and its end on a signal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def record(
     stopped: Callable[[], bool],
     limit: int | None = None,
 ) -> None:
-    """Write outcomes until they end, `stopped` says so, or `limit` pairs are done."""
+    """Write outcomes until they end, `stopped` returns True, or `limit` pairs are done."""
     for outcome in outcomes:
         if isinstance(outcome, Origin):
             outputs.begin_trajectory(outcome.segment, outcome.frame_id, outcome.child_frame_id)
@@ -54,7 +54,7 @@ def _write(outcome: Outcome, outputs: Outputs, summary: Summary) -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Within, SIGINT and SIGTERM only set what the given function returns, so that no row is left half written.
+    """Make SIGINT and SIGTERM only set the value of the function that is given, so that no row is left half written.
 
     A second signal does what it would have done: whoever insists does not wait for the pair at hand.
     """

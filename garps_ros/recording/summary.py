@@ -12,7 +12,7 @@ from rich.table import Table
 
 @dataclass
 class Summary:
-    """What happened to the messages and pairs of a replay."""
+    """Counts of the messages and pairs of a replay."""
 
     pairs: int = 0
     used: int = 0
@@ -22,14 +22,12 @@ class Summary:
     """Messages that could not be used at all."""
     first_refused: str = ""
     unpaired: int = 0
-    keyframes: int = 0
-    segments: int = 0
     broken_end: str = ""
     seconds: list[float] = field(default_factory=list)
-    """Wall time per pair, from messages to pose."""
+    """Wall time of each pair from messages to pose, s."""
 
     def count(self, status: str, published: bool, seconds: float | None) -> None:
-        """Count a pair by its status; `seconds` is its wall time, None where it never reached the estimator."""
+        """Count a pair by its status; `seconds` is its wall time, None if the core never got it."""
         self.pairs += 1
         if published:
             self.used += 1
@@ -44,15 +42,12 @@ class Summary:
         self.first_refused = self.first_refused or reason
 
     def table(self) -> Table:
-        """The summary for people."""
+        """Return the summary as a table for people."""
         table = Table(show_header=False, title="Replay")
         table.add_row("pairs in", str(self.pairs))
         table.add_row("poses used", str(self.used))
         for status, count in sorted(self.rejected.items()):
             table.add_row(f"rejected: {status}", str(count))
-        if self.segments:
-            table.add_row("keyframes", str(self.keyframes))
-            table.add_row("segments", str(self.segments))
         table.add_row("messages without partner", str(self.unpaired))
         table.add_row("messages refused", str(self.refused))
         if self.first_refused:

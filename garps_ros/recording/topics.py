@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a recording make a camera: as asked for, or guessed from types, names and first messages."""
+"""The choice of a camera's topics in a recording: as asked for, or guessed from types, names and first messages."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
 
-from garps_ros.cameras import CameraTopics
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.recording.bags import Bag, BagError
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -24,14 +24,14 @@ WITHOUT_DEPTH = (
 def choose_cameras(
     bag: Bag, source: CameraTopics, target: CameraTopics, pairing: str, depth: bool = True
 ) -> list[CameraTopics]:
-    """The cameras to use: [source, target], or [source] when one camera is followed against its keyframes.
+    """Return the cameras to use: [source, target], or [source] when one camera is followed against its keyframes.
 
     Args:
         bag: an open recording.
         source: topics that were asked for; empty ones are guessed.
-        target: likewise, of the second camera.
+        target: topics of the second camera; empty ones are guessed.
         pairing: "cameras", "keyframe" or "auto" (two cameras when there are two).
-        depth: every camera needs a depth topic; else none is used.
+        depth: whether every camera needs a depth topic; if not, none is used.
     Raises:
         BagError: a topic that is missing or of another type, no depth, or no one guess; lists what is there.
     """
@@ -106,7 +106,7 @@ def _only_camera(bag: Bag, name: str, other: CameraTopics, depth: bool, alone: b
 
 
 def _cameras(bag: Bag, depth: bool) -> list[CameraTopics]:
-    """Colour cameras, one per namespace, sorted; when some have camera_info and, where wanted, depth, only those."""
+    """Return the colour cameras, one per namespace, sorted; if any have camera_info and wanted depth, only those."""
     infos = [topic for topic, kind in bag.types.items() if kind in INFO_TYPES]
     depths = _depths(bag)
     best: dict[str, str] = {}
@@ -134,7 +134,7 @@ def _depths(bag: Bag) -> list[str]:
 
 
 def _is_depth(bag: Bag, topic: str) -> bool:
-    """What the first message says; the name decides for mono16, bare png and what cannot be decoded."""
+    """Tell from the first message; the name decides for mono16, bare png and messages that cannot be decoded."""
     message = bag.first(topic)
     told = str(getattr(message, "encoding", None) or getattr(message, "format", ""))
     if told.startswith(("16UC1", "32FC1")) or "compressedDepth" in told:
@@ -143,12 +143,12 @@ def _is_depth(bag: Bag, topic: str) -> bool:
 
 
 def _preference(topic: str) -> tuple[bool, bool, str]:
-    """Raw before compressed transport, rectified before not, then by name."""
+    """Sort key: raw before compressed transport, rectified before not, then by name."""
     return topic != _stem(topic), "rect" not in topic, topic
 
 
 def _stem(topic: str) -> str:
-    """The topic without the suffix of an image transport."""
+    """Return the topic without the suffix of an image transport."""
     head, _, tail = topic.rpartition("/")
     return head if tail in TRANSPORTS else topic
 
@@ -162,7 +162,7 @@ def _info_of(image: str, infos: Iterable[str]) -> str:
 
 
 def _depth_of(image: str, depths: list[str]) -> str:
-    """The depth whose name shares most with the image's, those that say they are registered first; "" if none."""
+    """Return the depth whose name shares most with the image's, registered ones first; "" if there is none."""
     registered = [topic for topic in depths if any(word in topic for word in REGISTERED)]
     ranked = sorted(
         depths, key=lambda topic: (-_shared(image, topic), topic not in registered, topic != _stem(topic), topic)
@@ -171,6 +171,6 @@ def _depth_of(image: str, depths: list[str]) -> str:
 
 
 def _shared(a: str, b: str) -> int:
-    """How many leading parts two topic names share."""
+    """Count the leading parts that two topic names share."""
     parts = list(zip(a.split("/"), b.split("/"), strict=False))
     return next((i for i, (x, y) in enumerate(parts) if x != y), len(parts))

@@ -3,21 +3,13 @@
 
 import os
 import signal
-import time
 from functools import partial
 from pathlib import Path
 
 import pytest
-from dask_cluster import ENVIRONMENT, running_cluster
+from dask_cluster import ENVIRONMENT, running_cluster, slow_square
 
-from bench.rows.jobs import computed
-
-
-def slow_square(number: int, notes: Path) -> tuple[int, int]:
-    """Also leaves a note of the process that did it."""
-    (notes / f"{number}.{os.getpid()}").touch()
-    time.sleep(0.3)
-    return number * number, os.getpid()
+from bench.machine.jobs import computed
 
 
 def fails_at(number: int) -> int:

@@ -8,11 +8,12 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from bench.pairs.datasets import Pair
 from bench.pairs.learned_rooms import KINDS, SPLITS, kind_of, level_of
+from bench.pairs.pair import Pair
 from bench.report.acceptance import Bar, bars, differences
+from bench.report.depth_tables import depth_tables
 from bench.rooms import LEVELS
-from bench.scoring.depth_errors import depth_errors, depth_tables, errors_of_pair
+from bench.rows.depth_errors import depth_errors, errors_of_pair
 from bench.train_depth import HELD_OUT_SEED
 from bench.training.rooms import FIRST_SEED
 from garps_core import View

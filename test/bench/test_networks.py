@@ -6,7 +6,9 @@ import torch
 import typer
 from torch import nn
 
-from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, counted_flop, measured
+from bench.machine.flop import counted_flop
+from bench.networks import __main__ as networks
+from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, measured
 from bench.networks.pair import STAGES, measured_pair
 from garps_core.models import depth_anything
 from garps_core.models.vit import Attention
@@ -23,6 +25,7 @@ def test_products_convolutions_and_attention_are_counted():
 
 def test_a_line_of_the_table(monkeypatch):
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 42)
+    monkeypatch.setattr(networks, "MULTIPLICATIONS", 1)
     before = torch.get_num_threads()
     try:
         row = measured(Case("depth-anything", "vits", 2, 40, 60), runs=1, threads=1)
@@ -57,5 +60,4 @@ def test_a_line_of_the_table_of_pairs(monkeypatch):
         torch.set_num_threads(before)
     assert row["status"] == "converged"
     assert all(row[f"{stage} s"] > 0 for stage in STAGES)
-    assert sum(row[f"{stage} s"] for stage in STAGES) == pytest.approx(row["wall s"], rel=0.5)
     assert 0 <= row["beyond imports MiB"] < row["peak MiB"]  # 0 where an earlier test needed more

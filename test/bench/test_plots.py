@@ -18,7 +18,7 @@ from bench.report.plots import (
     quality_reliability,
     write_plots,
 )
-from bench.scoring.tables import ERRORS
+from bench.rows.row import ERRORS
 
 INF = float("inf")
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from clips import HEIGHT, WIDTH, motion, track_line, write_frames, write_sparse, write_track
 
-from bench.pairs.datasets import rng_of
+from bench.pairs.pair import rng_of
 from bench.pairs.readers import READERS, MissingFiles, load, pair_list, realestate10k, sfm_scale
-from bench.pairs.readers.files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
+from bench.pairs.readers.dataset_files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
 from garps_core.geometry import project, transform
 
 
@@ -297,7 +297,7 @@ def test_inputs_are_bounded(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no UTF-8 text"):
         text_of(path)
     np.savez_compressed(tmp_path / "bomb.npz", points=np.zeros(10_000))
-    monkeypatch.setattr("bench.pairs.readers.files.MAX_BYTES", 2000)
+    monkeypatch.setattr("bench.pairs.readers.dataset_files.MAX_BYTES", 2000)
     with pytest.raises(ValueError, match="unpacked"):
         arrays(tmp_path / "bomb.npz")
     path.write_bytes(b"1" * 2001)

@@ -18,8 +18,8 @@ pytest.importorskip("embreex")
 
 from bench import repeat, run
 from bench.pairs import sources
-from bench.pairs.datasets import read_pairs
-from bench.peers.baselines import METHODS
+from bench.pairs.readers.pairs_json import read_pairs
+from bench.peers.methods import METHODS
 from garps_core import Config, View
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.scoring.scores import (
-    VCRE_PX,
-    auc,
-    camera_error_m,
-    mean_average_accuracy,
-    pose_error_deg,
-    precision_auc,
-    vcre_px,
-)
+from bench.rows.pose_errors import camera_error_m, vcre_px
+from bench.scoring.scores import VCRE_PX, auc, mean_average_accuracy, pose_error_deg, precision_auc
 from garps_core import metrics
 from garps_core.geometry import se3_exp
 

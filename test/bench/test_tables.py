@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from bench.pairs import sources
-from bench.peers.baselines import METHODS
-from bench.report import acceptance
-from bench.rows import evaluate, row_log
-from bench.scoring import tables
+from bench.peers.methods import METHODS
+from bench.report import acceptance, run_tables
+from bench.rows import pair_rows, row_log
+from bench.scoring import summary
 
 INF = float("inf")
 
@@ -27,19 +27,19 @@ def test_auc_counts_pairs_of_right_and_wrong(seed):
     rng = np.random.default_rng(seed)
     scores, right = rng.integers(0, 6, 40) / 5, rng.random(40) < 0.6
     counted = [(a > b) + 0.5 * (a == b) for a in scores[right] for b in scores[~right]]
-    assert tables.roc_auc(scores, right) == pytest.approx(np.mean(counted))
+    assert summary.roc_auc(scores, right) == pytest.approx(np.mean(counted))
 
 
 def test_auc_is_undefined_where_there_is_nothing_to_tell_apart():
-    assert np.isnan(tables.roc_auc([0.1, 0.9], [True, True]))
-    assert "undefined, all are right" in tables.quality_auc([made_row("garps", quality=0.4)])[1]
-    assert "undefined, all are wrong" in tables.quality_auc([made_row("garps", INF, quality=0.4)])[1]
-    assert "no quality" in tables.quality_auc([made_row("garps"), made_row("garps", INF)])[1]
+    assert np.isnan(summary.roc_auc([0.1, 0.9], [True, True]))
+    assert "undefined, all are right" in summary.quality_auc([made_row("garps", quality=0.4)])[1]
+    assert "undefined, all are wrong" in summary.quality_auc([made_row("garps", INF, quality=0.4)])[1]
+    assert "no quality" in summary.quality_auc([made_row("garps"), made_row("garps", INF)])[1]
 
 
 def test_failures_have_quality_zero():
     rows = [made_row("garps", 0.01, quality=0.3), made_row("garps", INF, quality=0.9)]
-    value, text = tables.quality_auc(rows)
+    value, text = summary.quality_auc(rows)
     assert value == 1
     assert text == "1.000 (1 of 2 within 5 cm and 2 deg)"
 
@@ -49,7 +49,7 @@ def test_tables_are_grouped_by_depth_and_set_with_confidence_below():
     rows = []
     for i, (depth, name) in enumerate(order):
         rows.append(made_row("garps", depth=depth, set=name, start=f"s{i}", nees=5.0 + 10 * (i == 3), quality=0.5))
-    text = tables.markdown(rows, {"reused_peers": "1 of 2 rows of peers were taken."})
+    text = run_tables.markdown(rows, {"reused_peers": "1 of 2 rows of peers were taken."})
     marks = ["sensor depth, b, start: s0", "sensor depth, b, start: s3", "sensor depth, b, all starts"]
     marks += ["sensor depth, a, start: s2", "sensor depth, all sets and starts", "monocular depth, b, start: s1"]
     places = [text.index(mark) for mark in marks]
@@ -154,7 +154,7 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
         made_row("open3d-gicp", INF), made_row("garps"), made_row("(start)"), made_row("garps-no-features"),
         made_row("open3d-gicp", start="features"), made_row("sift-pnp", start="features"),
     ]  # fmt: skip
-    tables.write(tmp_path, rows, {"seed": 0, "commit": "abc"})
+    run_tables.write(tmp_path, rows, {"seed": 0, "commit": "abc"})
     known = row_log.reusable_rows(tmp_path / "run.json", 0)
     assert {key[2]: list(found) for key, found in known.items()} == {
         "disturbed": ["open3d-gicp"],
@@ -171,15 +171,15 @@ def test_only_rows_that_owe_nothing_to_garps_are_reused(tmp_path):
 
 
 def test_known_rows_of_peers_are_taken_over():
-    from bench.pairs import bare
+    from bench.pairs import bare_rooms
     from garps_core import Config
 
-    pair = bare.room_pair(22, 1, 160, 120)
+    pair = bare_rooms.room_pair(22, 1, 160, 120)
     known = {"open3d-gicp": made_row("open3d-gicp", reused="abc")}
     methods = ["garps", "garps-no-features", "open3d-gicp"]
-    rows = evaluate.evaluate_pair(Config.preset("monocular"), pair, "none", methods, known=known)
+    rows = pair_rows.rows_of_pair(Config.preset("monocular"), pair, "none", methods, known=known)
     assert [row["method"] for row in rows] == ["(start)", "garps", "open3d-gicp"]
     assert rows[2] is known["open3d-gicp"]
     assert rows[1]["status"] and "quality" in rows[1]
-    disturbed = evaluate.evaluate_pair(Config.preset("monocular"), pair, "disturbed", methods[:2])
+    disturbed = pair_rows.rows_of_pair(Config.preset("monocular"), pair, "disturbed", methods[:2])
     assert [row["method"] for row in disturbed] == ["(start)", *methods[:2]]

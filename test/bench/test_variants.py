@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left out of GARPS is left out, and nothing else; a pair without a pose is a row."""
+"""A variant leaves its part out of GARPS and nothing else; a pair without a pose is a row."""
 
 from dataclasses import replace
 
@@ -8,12 +8,12 @@ import pytest
 
 pytest.importorskip("embreex")
 
-from bench.pairs.datasets import Pair, disturbed_prior, scene_points
+from bench.pairs.pair import Pair, scene_points
+from bench.pairs.starts import disturbed_prior
 from bench.rooms import make_pair
-from bench.rows.evaluate import START, evaluate_pair
-from bench.rows.variants import VARIANTS, estimate, isotropic, last_rung, without_frustum
-from garps_core import Config, View, estimate_relative_pose
-from garps_core.mixtures import reconstruct
+from bench.rows.pair_rows import START, rows_of_pair
+from bench.rows.variants import VARIANTS, isotropic, last_rung, variant_estimate, without_frustum
+from garps_core import Config, View, estimate_relative_pose, reconstruct
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -28,7 +28,7 @@ def pair() -> Pair:
 
 def test_as_it_is_it_is_garps(pair: Pair) -> None:
     prior = disturbed_prior(pair)
-    ours = estimate(VARIANTS["garps"], pair, Config(), prior)
+    ours = variant_estimate(VARIANTS["garps"], pair, Config(), prior)
     assert np.array_equal(
         ours.T_target_source, estimate_relative_pose(pair.source, pair.target, Config(), prior).T_target_source
     )
@@ -58,23 +58,23 @@ def test_every_variant_runs_and_changes_something(pair: Pair, name: str) -> None
     if name != "garps-no-features":  # a start as good as theirs begins on the last rung anyway
         changes["start.features"] = False
     config = Config.preset("monocular").replace(changes)
-    full, found = (estimate(VARIANTS[one], pair, config, prior) for one in ("garps", name))
+    full, found = (variant_estimate(VARIANTS[one], pair, config, prior) for one in ("garps", name))
     assert found.T_target_source is not None, found.reason
     assert np.array_equal(found.T_target_source, full.T_target_source) == (name == "garps")
     assert np.linalg.norm(found.T_target_source[:3, 3] - pair.T_target_source[:3, 3]) < 0.3
 
 
 def test_variants_are_rows_beside_garps(pair: Pair) -> None:
-    rows = evaluate_pair(Config(), pair, "disturbed", ["garps", "garps-labels", "garps-no-features"])
+    rows = rows_of_pair(Config(), pair, "disturbed", ["garps", "garps-labels", "garps-no-features"])
     assert [row["method"] for row in rows] == [START, "garps", "garps-labels", "garps-no-features"]
-    plain = evaluate_pair(Config(), replace(pair, labels=None), "none", ["garps", "garps-labels", "garps-no-features"])
+    plain = rows_of_pair(Config(), replace(pair, labels=None), "none", ["garps", "garps-labels", "garps-no-features"])
     assert [row["method"] for row in plain] == [START, "garps"]
     assert all(row["scale"] == "metres" and row["true_trans_m"] == pytest.approx(0.25) for row in rows)
 
 
 def test_a_pair_without_depth_is_a_row(pair: Pair) -> None:
     blind = replace(pair, source=replace(pair.source, depth=None))
-    rows = evaluate_pair(Config(), blind, "disturbed", ["garps", "garps-isotropic", "small-gicp", "sift-pnp"])
+    rows = rows_of_pair(Config(), blind, "disturbed", ["garps", "garps-isotropic", "small-gicp", "sift-pnp"])
     failed = {row["method"]: row["reason"] for row in rows if not row["found"]}
     assert {"garps", "garps-isotropic", "small-gicp"} <= set(failed) and "depth" in failed["garps"]
     assert all(row["e_3d_m"] == np.inf for row in rows if not row["found"])

@@ -2,7 +2,6 @@
 """From two views to a pose: the public interface as a whole, on rendered rooms and on a recorded camera."""
 
 import inspect
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.start.initialise import initialise
 
 PUBLIC = {
-    "Config": ["reconstruction", "lifting", "start", "alignment", "device", "dtype", "seed"],
+    "Config": ["reconstruction", "lifting", "start", "alignment", "paper", "method", "device", "dtype", "seed"],
     "ConfigError": None,
     "GarpsError": None,
     "InputError": None,
@@ -86,7 +85,7 @@ def test_an_estimate_is_complete(estimate):
     np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     assert set(estimate.seconds) == {"reconstruct", "initialise", "align"}
-    assert all(0 < seconds < 60 for seconds in estimate.seconds.values())
+    assert all(seconds > 0 for seconds in estimate.seconds.values())
     assert 0 < estimate.overlap <= 1 and estimate.iterations > 0 and np.isfinite(estimate.objective)
     assert "converged in" in estimate.reason and "\n" not in estimate.reason
 
@@ -241,8 +240,7 @@ def test_cuda_agrees_with_the_cpu(preset):
     """Neighbours at equal distances may be chosen differently, so not to the last bit."""
     config = Config.preset(preset)
     if preset == "paper":
-        ladder = (replace(config.alignment.ladder[0], steps=20),)
-        config = config.replace({"alignment.ladder": ladder, "alignment.component_stride": 4})
+        config = config.replace({"paper.steps": 20, "paper.component_stride": 4})
     mixtures = two_mixtures(config=config)
     cpu = align_mixtures(*mixtures, disturbed(), config)
     cuda = align_mixtures(*mixtures, disturbed(), config.replace({"device": "cuda"}))
@@ -259,10 +257,10 @@ def test_cuda_that_is_not_there_is_named():
 
 def lounge_pairs():
     """Three pairs of a recorded RGB-D camera; skipped where the recordings are not."""
-    datasets = pytest.importorskip("bench.pairs.datasets")
-    if "hololens_lounge" not in datasets.available(DATA):
+    pairs_json = pytest.importorskip("bench.pairs.readers.pairs_json")
+    if "hololens_lounge" not in pairs_json.available(DATA):
         pytest.skip(f"no recorded pairs in {DATA}/dev/hololens_lounge")
-    return datasets.load_pairs("hololens_lounge", DATA, limit=3)
+    return pairs_json.load_pairs("hololens_lounge", DATA, limit=3)
 
 
 def test_recorded_pairs_from_features():
@@ -275,9 +273,9 @@ def test_recorded_pairs_from_features():
 
 
 def test_recorded_pairs_from_a_disturbed_truth():
-    datasets = pytest.importorskip("bench.pairs.datasets")
+    starts = pytest.importorskip("bench.pairs.starts")
     for pair in lounge_pairs():
-        prior = datasets.disturbed_prior(pair)
+        prior = starts.disturbed_prior(pair)
         start = translation_error_m(prior.T_target_source, pair.T_target_source)
         estimate = estimate_relative_pose(pair.source, pair.target, prior=prior)
         assert estimate.T_target_source is not None, f"{pair.id}: {estimate.reason}"

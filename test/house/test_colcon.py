@@ -108,7 +108,7 @@ def run(environment: dict[str, str], command: list[str], folder: Path) -> subpro
 
 
 def test_a_build_with_symlinks_works_too(tmp_path: Path) -> None:
-    """What developers use; it needs setuptools below 80."""
+    """Developers use this; it needs setuptools below 80."""
     source = checkout(tmp_path)
     before = content(source)
     colcon_build(tmp_path, "--symlink-install")
@@ -182,7 +182,7 @@ def test_what_runs_is_what_was_installed(
 def test_the_installed_node_starts_and_ends(
     workspace: Path, environment: dict[str, str], tmp_path: Path, domain: str
 ) -> None:
-    """As `ros2 run` starts it, with the installed parameter file; stopped by Ctrl-C: exit code 0, no traceback."""
+    """Start it like `ros2 run`, with the installed parameter file; stopped by Ctrl-C: exit code 0, no traceback."""
     pytest.importorskip("rclpy")
     prefix = workspace / "install" / "garps_ros"
     command = [str(prefix / "lib/garps_ros/pose_node"), "--ros-args", "-r", "__ns:=/rig"]

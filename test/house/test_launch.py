@@ -85,7 +85,7 @@ def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def started(description: list[Any], **given: str) -> list[Any]:
-    """What the launch starts when these arguments are given; checked as Jazzy would."""
+    """Return what the launch starts when these arguments are given; checked as Jazzy would."""
     arguments = {action.name: action for action in description if isinstance(action, DeclareLaunchArgument)}
     assert set(given) <= set(arguments)
     for name, value in given.items():
@@ -203,7 +203,7 @@ def test_only_topics_of_the_node_are_remapped(description: list[Any]) -> None:
 
 @functools.cache
 def node_topics() -> set[str]:
-    """What the pose node subscribes and publishes, as a running one says; a process of its own that meets nobody."""
+    """Return the topics that a running pose node subscribes and publishes; its process meets no other."""
     pytest.importorskip("rclpy")
     code = (
         "import rclpy; from rclpy.node import Node; from garps_ros.live.node import PoseNode; rclpy.init()\n"

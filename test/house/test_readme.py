@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the README and docs/ say is true: their code runs, their commands, options, settings, paths and links exist."""
+"""README and docs/ are true: their code runs, their commands, options, settings, paths and links exist."""
 
 import ast
 import importlib.util
@@ -22,6 +22,8 @@ README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PLUGINS = ("two_view_models.md", "extending.md")
 """Pages whose code is a package, installed and run by test_two_view_adapter.py and test_depth_networks.py."""
+FOLDERS = ("docs", "garps_core", "garps_ros", "msg_adapters", "bench", "test")
+FILES = [str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
 WEIGHTS_COMMANDS = ("list", "fetch", "verify", "convert", "check")
 K = np.array([[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
 
@@ -48,7 +50,7 @@ def spoken(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """a.png, b.png and their depths, rendered with the README's K; and the true T_b_a."""
+    """Folder of a.png, b.png and their depths, rendered with the README's K; and the true T_b_a."""
     pytest.importorskip("trimesh")
     from bench.rooms import make_pair, make_room
 
@@ -156,7 +158,7 @@ def test_named_options_exist(path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_named_settings_exist(path: Path) -> None:
     known = Config().settings()
     for setting in re.findall(r"(?<![\w.])((?:reconstruction|lifting|start|alignment)\.\w+)(?![\w.]|\()", spoken(path)):
-        assert setting in known or setting == "alignment.md"
+        assert setting in known or setting.endswith((".md", ".py"))
 
 
 @pytest.mark.parametrize("path", PAGES, ids=name)
@@ -164,8 +166,20 @@ def test_named_files_and_links_exist(path: Path) -> None:
     text = path.read_text("utf-8")
     for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
         assert link.startswith("https://") or (path.parent / link).exists(), link
-    for mention in re.findall(r"`((?:docs|garps_core|garps_ros|msg_adapters|bench|test)/[\w/.-]+)`", text):
-        assert (ROOT / mention).exists(), mention
+    for mention in re.findall(rf"(?<![\w./])({'|'.join(FOLDERS)})/([\w/.-]*\w)", spoken(path)):
+        assert (ROOT / "/".join(mention)).exists(), "/".join(mention)
+    for mention in re.findall(r"`([\w/]+\.py)`", text):
+        assert any(f"/{file}".endswith(f"/{mention}") for file in FILES), mention
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name)
+def test_named_parts_of_files_exist(path: Path) -> None:
+    """`file.name`, where a file of the packages has that stem: one of them holds the name."""
+    for stem, part in re.findall(r"`([a-z_0-9]+)\.([A-Za-z_]\w+)`", path.read_text("utf-8")):
+        texts = [(ROOT / file).read_text("utf-8") for file in FILES if Path(file).stem == stem]
+        settings = any(setting.endswith(f"{stem}.{part}") for setting in Config().settings())
+        if texts and part not in ("py", "md", "csv", "json") and not settings:
+            assert any(re.search(rf"\b{part}\b", text) for text in texts), f"{stem}.{part}"
 
 
 def test_every_status_is_explained() -> None:

@@ -135,16 +135,16 @@ def test_a_recording_is_replayed_with_it(room: RoomPair, depths: Path, tmp_path:
 
 
 def test_the_node_takes_the_parameter_loads_it_and_names_it(depths: Path) -> None:
-    from garps_ros.live.estimator import Solver
+    from garps_ros.live.jobs import JobRunner
     from garps_ros.parameters.parameter import parameters, settings_from
 
     given = {parameter.name: parameter.default for parameter in parameters("monocular")}
     given |= {"preset": "monocular", "reconstruction.method": NAME, "reconstruction.depth_weights": str(depths)}
     _, config = settings_from(given)
     said: list[str] = []
-    solver = Solver(said.append)
-    solver.prepare(config)
-    assert solver.scale == f"{NAME} (weights {depths}), m", "what /diagnostics shows as `scale from`"
+    runner = JobRunner(said.append)
+    runner.prepare(config)
+    assert runner.scale == f"{NAME} (weights {depths}), m", "what /diagnostics shows as `scale from`"
     assert said[0].startswith(f"loaded {NAME} (weights {depths}) in ")
 
 

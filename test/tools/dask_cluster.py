@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real Dask cluster on this machine: a scheduler and two workers, each a process of its own."""
+"""A real Dask cluster on this machine: a scheduler and two workers, each a process of its own, and work for them."""
 
 import json
 import os
@@ -12,7 +12,15 @@ from pathlib import Path
 
 from places import ROOT
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "test")])}
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "test" / "tools")])}
+"""In it, other processes can import this file and the packages."""
+
+
+def slow_square(number: int, notes: Path) -> tuple[int, int]:
+    """The square and the process that made it, which also leaves a note of it."""
+    (notes / f"{number}.{os.getpid()}").touch()
+    time.sleep(0.3)
+    return number * number, os.getpid()
 
 
 @contextmanager

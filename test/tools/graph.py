@@ -40,7 +40,7 @@ __all__ = [
 ]  # fmt: skip
 
 FIRST_PORT = 21000
-"""A domain is held by a listening socket on this port + its number."""
+"""Base of the ports: a domain is held by a socket bound to this port + its number."""
 DOMAINS = range(1, 102)  # beyond, DDS would use ports that Linux hands out to anybody
 SIZE = (320, 240)
 SECOND = 1_000_000_000
@@ -131,7 +131,7 @@ class Peer:
         return value
 
     def matched(self, *publishers: Any, count: int = 1) -> None:
-        """Wait until each publisher has so many subscriptions.
+        """Wait until each publisher has that number of subscriptions.
 
         The subscriber may know of the publisher a little later: a best-effort message sent now can still be lost.
         """
@@ -159,7 +159,7 @@ class Peer:
         return result.successful, result.reason
 
     def diagnostics(self) -> dict[str, tuple[int, str, dict[str, str]]]:
-        """What was last received of each status: name -> (level, message, values)."""
+        """Return the last of each status: name -> (level, message, values)."""
         return self._diagnostics
 
     def _diagnosed(self, message: DiagnosticArray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from bench.peers.baselines import METHODS
+from bench.peers.methods import METHODS
 
 NEEDS = {
     "small-gicp": ("small_gicp",),

@@ -67,8 +67,8 @@ class NodeProcess:
         """Send a signal to the node alone, as a launch file does."""
         self.process.send_signal(number)
 
-    def wait(self, seconds: float = 10.0) -> int:
-        """The exit code; on a hang it is made to say where it hangs, killed, and the test fails."""
+    def wait(self, seconds: float = PATIENCE_S) -> int:
+        """Return the exit code; a node that hangs is made to say where, killed, and the test fails."""
         try:
             return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -76,8 +76,16 @@ class NodeProcess:
         pytest.fail(f"node still runs {seconds:g} s after it was told to end\n{self._tail(100)}")
 
     def log(self) -> str:
-        """What the node has written so far."""
+        """Return everything that the node has written so far."""
         return self._log.read_text(encoding="utf-8", errors="replace")
+
+    def wait_for(self, text: str) -> None:
+        """Wait until the node has written a text; the test fails when that takes too long."""
+        end = time.monotonic() + PATIENCE_S
+        while text not in self.log():
+            if time.monotonic() > end:
+                pytest.fail(f"waited {PATIENCE_S:g} s for {text!r}\n{self._tail()}")
+            time.sleep(0.05)
 
     def _kill(self) -> None:
         if self.process.poll() is None:
@@ -141,7 +149,7 @@ class Nursery:
 
 
 class Born:
-    """What tests use of Popen, for a process of a nursery."""
+    """The part of Popen that tests use, for a process of a nursery."""
 
     def __init__(self, pid: int, nursery: Nursery) -> None:
         self.pid, self._nursery = pid, nursery

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the running node share: node and peer, two cameras, the offline result to compare with."""
+"""Tools of the tests of a running node: node and peer, two cameras, the offline result to compare with."""
 
 import time
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ from nav_msgs.msg import Odometry
 
 NODE = "/pose_node"
 EQUAL = 1e-6
-"""m, rad and their squares: how close the live pose is to the offline one."""
+"""Largest difference of the live pose from the offline one, m, rad and their squares."""
 CHEAP = ["lifting.stride=4", "start.max_features=1000"]
 
 
@@ -110,7 +110,7 @@ def count(peer, name, key):
     return int(values(peer, name).get(key, 0))
 
 
-def finding(peer, name, text):
-    """Wait until a status says a text; returns its level."""
+def check(peer, name, text):
+    """Wait until a status holds a text; return its level."""
     peer.wait(lambda: text in peer.diagnostics().get(f"pose_node: {name}", (0, "", {}))[1], what=f"{name}: {text!r}")
     return peer.diagnostics()[f"pose_node: {name}"][0]

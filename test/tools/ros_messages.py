@@ -19,7 +19,7 @@ def rclpy_class(name):
 
 
 def message_class(library):
-    """From a full message name to the class of a library; skips where rclpy is not installed."""
+    """Return a function from a full message name to a library's class; skip where rclpy is not installed."""
     if library == "rclpy":
         pytest.importorskip("rclpy")
         return rclpy_class

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of public data sets: a name and a folder become pairs with true pose.
+"""Readers of data sets: a name and a folder become pairs with the true pose.
 
-Each module says which files it expects where. Nothing is downloaded, nothing is guessed: what is missing is listed.
+To add a data set, write one file here, `read(folder, *, limit=None, skipped=None) -> list[Pair]`, and add one line to
+`READERS`. `python -m bench.run --data NAME=FOLDER` then takes its name. `dataset_files` has what readers share.
+Each reader's docstring gives the layout of its folder. Nothing is downloaded. Missing files are listed.
 """
 
 from __future__ import annotations
@@ -11,9 +13,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.pairs.datasets import Pair
+from bench.pairs.pair import Pair
 from bench.pairs.readers import mapfree, pair_list, realestate10k, scannet1500, seven_scenes, tum
-from bench.pairs.readers.files import MissingFiles
+from bench.pairs.readers.dataset_files import MissingFiles
 
 __all__ = ["READERS", "MissingFiles", "load"]
 
@@ -37,7 +39,7 @@ def load(
     Args:
         name: of `READERS`.
         folder: where it lies, in the layout that the reader's module describes.
-        limit: at most so many pairs, spread evenly; None = all.
+        limit: largest number of pairs, spread evenly; None = all.
         skipped: None = every file must be there; a list = pairs with missing files are left out and named in it.
         options: of the reader.
     Raises:

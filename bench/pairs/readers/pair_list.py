@@ -17,8 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from bench.pairs.datasets import Pair
-from bench.pairs.readers.files import Candidate, category_of, gathered, image, inside, pair_of, require, text_of, view
+from bench.pairs.pair import Pair
+from bench.pairs.readers.dataset_files import (
+    Candidate,
+    category_of,
+    gathered,
+    image,
+    inside,
+    pair_of,
+    require,
+    text_of,
+    view,
+)
 from garps_core.checks import Float64Array, checked_intrinsics, checked_rigid
 from garps_core.types import View
 
@@ -94,7 +104,7 @@ class Record:
 
     @property
     def scale_text(self) -> str:
-        """What `Pair.scale` says: "raw", or "sfm-depth x1.234"."""
+        """The text for `Pair.scale`: "raw", or "sfm-depth x1.234"."""
         return self.scale_source if self.scale_source == RAW else f"{self.scale_source} x{self.scale:.4g}"
 
 
@@ -157,7 +167,7 @@ def read(
 
     Args:
         folder: of the data set.
-        limit: at most so many, spread evenly.
+        limit: largest number of pairs, spread evenly; None = all.
         skipped: a list to name pairs with missing images in, instead of raising.
         list_file: the list, relative to the folder.
         name: of the set.

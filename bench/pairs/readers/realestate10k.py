@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, rng_of
+from bench.pairs.pair import Pair, rng_of
 from bench.pairs.readers import pair_list
-from bench.pairs.readers.files import (
+from bench.pairs.readers.dataset_files import (
     MissingFiles,
     category_of,
     depth_map,
@@ -43,7 +43,7 @@ from garps_core.geometry import se3_inverse, transform
 NAME = "realestate10k"
 FIRST, LAST = 0, 29
 SPLITS = {"test": ("test", 100), "validation": ("train", 10)}
-"""Which tracks a list is drawn from, and how many pairs of each category."""
+"""Folder of tracks that a list is drawn from, and pairs of each category."""
 SCALES = (RAW, SOURCE)
 COLUMNS = "timestamp fx fy cx cy k1 k2 r11 r12 r13 t1 r21 r22 r23 t2 r31 r32 r33 t3"
 LAYOUT = "cameras/SPLIT/CLIP.txt and frames/CLIP/TIMESTAMP.jpg or .png"

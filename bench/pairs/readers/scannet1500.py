@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from bench.pairs.datasets import Pair
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair
+from bench.pairs.readers.dataset_files import (
     Candidate,
     Rgb,
     arrays,
@@ -51,7 +51,7 @@ def read(folder: Path, *, limit: int | None = None, skipped: list[str] | None = 
 
     Args:
         folder: of the release.
-        limit: at most so many, spread evenly; all 1500 with depth take about 7 GB.
+        limit: largest number of pairs, spread evenly; all 1500 with depth take about 7 GB.
         skipped: a list to name pairs with missing files in, instead of raising.
         depth: False reads colour only; then there are no true points.
     Raises:

@@ -17,8 +17,8 @@ import functools
 import re
 from pathlib import Path
 
-from bench.pairs.datasets import Pair, rng_of
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair, rng_of
+from bench.pairs.readers.dataset_files import (
     Candidate,
     chosen,
     depth_map,
@@ -57,7 +57,7 @@ def read(
 
     Args:
         folder: one scene.
-        limit: at most so many of them, spread evenly.
+        limit: largest number of them, spread evenly.
         skipped: a list to name pairs with missing files in, instead of raising.
         gap: frames between source and target.
         count: pairs drawn.

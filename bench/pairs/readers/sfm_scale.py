@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.readers.files import arrays, floats, rows
+from bench.pairs.readers.dataset_files import arrays, floats, rows
 from garps_core.checks import Float32Array, Float64Array
 from garps_core.geometry import project
 
@@ -24,7 +24,7 @@ MIN_POINTS = 10
 
 
 def depth_scale(depth: Float32Array, K: Float64Array, points: Float64Array, rng: np.random.Generator) -> float:
-    """What to multiply the clip's unit with.
+    """The factor from the clip's unit to metres.
 
     Args:
         depth: HxW m along z, NaN = no reading.

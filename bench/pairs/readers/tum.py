@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.pairs.datasets import Pair, rng_of
-from bench.pairs.readers.files import (
+from bench.pairs.pair import Pair, rng_of
+from bench.pairs.readers.dataset_files import (
     Candidate,
     chosen,
     depth_map,
@@ -86,7 +86,7 @@ def read(
 
     Args:
         folder: one sequence.
-        limit: at most so many of them, spread evenly.
+        limit: largest number of them, spread evenly.
         skipped: a list to name pairs with missing images in, instead of raising.
         gap: frames (those that have depth and truth) between source and target.
         count: pairs drawn.

@@ -135,7 +135,7 @@ def test_no_pose_is_code_1_with_the_reason(
     files: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     none = PoseEstimate(Status.NO_INITIAL_POSE, "4 matches, 12 are needed")
-    monkeypatch.setattr(command, "estimate_with_mixtures", lambda *_: (none, None))
+    monkeypatch.setattr(command.Estimator, "estimate_with_mixtures", lambda *_: (none, None))
     assert command.main(arguments(files, "--figure", str(tmp_path / "a.png"))) == 1
     captured = capsys.readouterr()
     assert "no_initial_pose: 4 matches" in captured.out
@@ -150,11 +150,11 @@ def test_no_pose_is_code_1_with_the_reason(
 def test_a_prior_is_read_in_ros_quaternion_order(files: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Prior] = []
 
-    def keep(_source: object, _target: object, _config: object, prior: Prior) -> tuple[PoseEstimate, None]:
+    def keep(_self: object, _source: object, _target: object, prior: Prior, _maps: None) -> tuple[PoseEstimate, None]:
         seen.append(prior)
         return PoseEstimate(Status.NO_INITIAL_POSE, ""), None
 
-    monkeypatch.setattr(command, "estimate_with_mixtures", keep)
+    monkeypatch.setattr(command.Estimator, "estimate_with_mixtures", keep)
     quarter = "-1 2 3 0 0 0.70710678 0.70710678"
     assert command.main([*without(arguments(files), "--prior"), "--prior", quarter, "--prior-sigma", "0.2 0.1"]) == 1
     T = seen[0].T_target_source

@@ -33,7 +33,7 @@ def depth() -> Tensors:
 
 @pytest.fixture(scope="module")
 def flash3d() -> Tensors:
-    """As in the real file, with a part that is never read."""
+    """Tensors as in the real file, with a part that is never read."""
     other = {"models.unidepth_extended.unidepth.pixel_encoder.cls_token": torch.ones(3)}
     return tensors_of("flash3d") | other | {"backproject_depth.0.ones": torch.ones(1)}
 
@@ -51,7 +51,7 @@ def weights(*words: object) -> int:
 
 
 def refused(capsys: Printed, *words: object) -> str:
-    """The one line that a mistake is answered with."""
+    """The single line that a mistake prints."""
     capsys.readouterr()
     assert weights(*words) == 2
     line = capsys.readouterr().err

@@ -12,8 +12,8 @@ from garps_core import Config, View
 from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma
 from garps_core.geometry import pixel_rays, project
-from garps_core.mixtures import reconstruct
 from garps_core.mixtures.frustum import FRUSTUM_STEP_PX
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import to_device, visible
 
 UNSMOOTHED = Config().replace({"lifting.smoothing_px": 0})

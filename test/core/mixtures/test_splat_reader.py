@@ -11,7 +11,7 @@ from random_splats import random_mixture
 
 from garps_core import Config
 from garps_core.errors import InputError
-from garps_core.mixtures import reconstruct
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.mixtures.splat_reader import NEEDED, read_splats
 from garps_core.mixtures.splat_writer import SH_CONSTANT, write_splats
 from garps_core.types import Mixture, View

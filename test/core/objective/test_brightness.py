@@ -244,7 +244,7 @@ def test_gradient_is_that_of_the_weighted_residuals(views, twist):
     T = se3_exp(0.5 * twist) @ TRUTH
 
     def pixels(pose):
-        return brightness._seen_at(x.points @ pose[:3, :3].T + pose[:3, 3], y)
+        return brightness._pixels_of(x.points @ pose[:3, :3].T + pose[:3, 3], y)
 
     reach = [T, *(se3_exp(sign * 4e-3 * e) @ T for e in np.eye(6) for sign in (1, -1))]
     kept = np.isfinite([pixels(pose)[:, 0] for pose in reach]).all(axis=0)

@@ -9,13 +9,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import INLINE, problem_of
 from surfaces import DISTURBANCE, FREE, TRUTH, K, disturbed, off, random_mixture, random_pose, two_views
 
 from garps_core import Config, Prior, Status, align_mixtures
-from garps_core.align import _known
 from garps_core.config import Alignment, Rung
 from garps_core.depth_errors import depth_modes, error_fields
 from garps_core.geometry import inverted, se3_exp, se3_inverse, se3_log
+from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.pairs import pair_up, to_device
 from garps_core.objective.shape import evaluate, row_information
@@ -36,7 +37,7 @@ SEEDS = st.integers(0, 10**6)
 
 def pairs_of(rows_seed=1, partners_seed=2, T=POSE):
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (rows_seed, partners_seed))
-    return pair_up(rows, partners, T, Rung(2.0, 1000, 9, 1), SETTINGS)
+    return pair_up(rows, partners, T, Rung(covariance_scale=2.0, components=1000, neighbours=9, steps=1), SETTINGS)
 
 
 FORWARD, BACKWARD = pairs_of(), pairs_of(2, 1, se3_inverse(POSE))
@@ -70,8 +71,8 @@ def test_gradient_of_both_directions_follows_a_partner_s_field_at_its_row_s_plac
     sizes = []
     for size in (0.0, 0.03):
         at = State(POSE, drawn(seed, size))
-        numeric = numeric_gradient(lambda there: two_way(FORWARD, BACKWARD, there).value, at)
-        got = two_way(FORWARD, BACKWARD, at)
+        numeric = numeric_gradient(lambda there: two_way(FORWARD, BACKWARD, there, INLINE).value, at)
+        got = two_way(FORWARD, BACKWARD, at, INLINE)
         scale = np.sqrt(np.diag(got.information))
         sizes.append(np.linalg.norm((got.gradient - numeric) / scale) / np.linalg.norm(numeric / scale))
     assert sizes[0] < 1e-6 < sizes[1] < 0.15
@@ -109,7 +110,7 @@ def test_swapping_the_views_swaps_the_unknowns(seed):
     """Value and derivatives of the swapped problem, seen through `backward_jacobian`, are those of the problem."""
     at = State(random_pose(seed, 0.02) @ POSE, drawn(seed, 0.02))
     back = State(se3_inverse(at.T), np.roll(at.errors, MODES))
-    e, swapped = two_way(FORWARD, BACKWARD, at), two_way(BACKWARD, FORWARD, back)
+    e, swapped = two_way(FORWARD, BACKWARD, at, INLINE), two_way(BACKWARD, FORWARD, back, INLINE)
     B = backward_jacobian(at.T, 2 * MODES)
     assert swapped.value == pytest.approx(e.value, rel=1e-12)
     np.testing.assert_allclose(B.T @ swapped.gradient, e.gradient, atol=1e-11 * np.abs(e.gradient).max())
@@ -150,7 +151,11 @@ def test_corrected_points_stay_on_their_rays():
 def test_correcting_the_clouds_is_evaluating_with_the_errors():
     """Of the rows to the last digit: what the solver does between its rungs changes nothing."""
     rows, partners = (to_device(random_mixture(seed, 60), DOUBLE) for seed in (1, 2))
-    errors, rung, far = drawn(6, 0.03)[:MODES], Rung(2.0, 1000, 60, 1), replace(SETTINGS, max_distance_m=100.0)
+    errors, rung, far = (
+        drawn(6, 0.03)[:MODES],
+        Rung(covariance_scale=2.0, components=1000, neighbours=60, steps=1),
+        replace(SETTINGS, max_distance_m=100.0),
+    )
     of_corrected = pair_up(corrected(rows, errors), partners, POSE, rung, far)
     plain = pair_up(rows, partners, POSE, rung, far)
     got = evaluate_jointly(of_corrected, POSE, NONE, NONE)
@@ -170,8 +175,7 @@ def wrong_in_scale(gains=(1.03, 0.99), shapes=(0.0, 0.0)):
 
 
 def solved(mixtures, config, prior):
-    x, y = (to_device(mixture, config) for mixture in mixtures)
-    (solution,) = ladder.anneal(x, y, _known(prior, config), config.alignment)
+    (solution,) = ladder.anneal(problem_of(mixtures, weighted_start(prior, config), config))
     return solution
 
 
@@ -218,7 +222,7 @@ def test_exact_maps_keep_their_shape():
 
 
 def test_depth_errors_are_not_solved_for_unless_asked():
-    assert len(_known(disturbed(), Config()).error_precision) == 0
-    assert len(_known(disturbed(), MONOCULAR).error_precision) == 2 * MODES
+    assert len(weighted_start(disturbed(), Config()).error_precision) == 0
+    assert len(weighted_start(disturbed(), MONOCULAR).error_precision) == 2 * MODES
     paper = Config.preset("paper").replace({"alignment.depth_errors": True})
-    assert len(_known(disturbed(), paper).error_precision) == 0, "the paper has no such unknowns"
+    assert len(weighted_start(disturbed(), paper).error_precision) == 0, "the paper has no such unknowns"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A guess and two pictures: brightness alone leads near the pose from far away, or says that it cannot."""
+"""From a guess and two images, brightness alone leads near the pose from far away, or gives none."""
 
 from dataclasses import replace
 
@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from surfaces import off, room
 
-from garps_core import Config, align
-from garps_core.mixtures import reconstruct
+from garps_core import Config
+from garps_core.mixture_alignment import weighted_start
+from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.solver import search
-from garps_core.solver.brightness_search import PURSUED, search_by_brightness
+from garps_core.solver.brightness_search import CONTINUED, search_by_brightness
 from garps_core.start.initialise import identity
 
-KNOWN = align._known(identity(Config(), ""), Config())
-AROUND = search.starting_poses(KNOWN, search.FINE_RINGS)
+START = weighted_start(identity(Config(), ""), Config())
+AROUND = search.starting_poses(START, search.FINE_RINGS)
 
 
 def frustums(seed, level):
@@ -23,23 +24,23 @@ def frustums(seed, level):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_best_glance_is_within_a_few_degrees_where_the_guess_was_twenty_off(seed):
+def test_the_best_end_is_within_a_few_degrees_where_the_guess_was_twenty_off(seed):
     source, target, truth = frustums(seed, 4)
     assert np.degrees(off(np.eye(4), truth)[1]) > 19
-    found = search_by_brightness(source, target, KNOWN, AROUND)
-    assert 1 <= len(found) <= PURSUED
+    found = search_by_brightness(source, target, START, AROUND)
+    assert 1 <= len(found) <= CONTINUED
     assert np.degrees(min(off(T, truth)[1] for T in found[:3])) < 6
 
 
-def test_the_order_is_that_of_agreement_not_of_the_beginnings():
+def test_the_order_is_that_of_agreement_not_of_the_starting_poses():
     source, target, _ = frustums(1, 4)
-    found, backwards = (search_by_brightness(source, target, KNOWN, begin) for begin in (AROUND, AROUND[::-1]))
+    found, backwards = (search_by_brightness(source, target, START, poses) for poses in (AROUND, AROUND[::-1]))
     np.testing.assert_allclose(found[0], backwards[0], atol=1e-9)
 
 
 def test_without_brightness_or_contrast_there_is_none():
     source, target, _ = frustums(1, 1)
-    assert search_by_brightness(source, target, KNOWN, AROUND)
-    assert search_by_brightness(replace(source, brightness=None), target, KNOWN, AROUND) == []
+    assert search_by_brightness(source, target, START, AROUND)
+    assert search_by_brightness(replace(source, brightness=None), target, START, AROUND) == []
     flat = np.full_like(source.brightness, 0.5)
-    assert search_by_brightness(replace(source, brightness=flat), replace(target, brightness=flat), KNOWN, AROUND) == []
+    assert search_by_brightness(replace(source, brightness=flat), replace(target, brightness=flat), START, AROUND) == []

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver finds the pose, in either direction and any frame, and says when there is none to be found."""
+"""The solver finds the pose, in either direction and in any frame, and tells when there is none."""
 
+import os
+import signal
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 import surfaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import INLINE, problem_of
 from surfaces import DISTURBANCE, FREE, TRUTH, disturbed, flat, grey_at, moved, off, permuted, random_pose, two_mixtures
 
 from garps_core import Config, Prior, Status, align_mixtures
@@ -37,10 +41,9 @@ def small():
 
 @pytest.fixture(scope="module")
 def rung(views):
-    """Both directions' pairs of the last rung at the disturbed start, and the start's twist covariance."""
-    x, y = (to_device(mixture, DOUBLE) for mixture in views)
+    """Pairs of the last rung in both directions at a disturbed start, and the start's pose."""
     start = disturbed(twist=0.2 * DISTURBANCE).T_target_source
-    return *ladder.rung_pairs(x, y, start, LADDER[-1], DOUBLE.alignment, density=1.0), start
+    return *ladder.rung_pairs(problem_of(views, config=DOUBLE), start, LADDER[-1], density=1.0), start
 
 
 def test_the_start_is_as_far_off_as_it_claims():
@@ -81,7 +84,7 @@ def test_swapping_the_views_gives_the_inverse_pose_and_covariance(views):
 
 
 def test_moving_the_target_frame_moves_the_estimate_with_it(small):
-    """Without a camera nothing is special about the target frame; shared depth errors, which know one, are off."""
+    """Without a camera no frame is special; shared depth errors, which have one, are off."""
     source, target = (replace(mixture, frustum=None) for mixture in small)
     config = EXACT.replace({f"lifting.{name}": 0.0 for name in ("scale_sigma", "warp_sigma", "pointing_sigma_rad")})
     B = random_pose(9, 1.0)
@@ -116,6 +119,25 @@ def test_the_same_input_gives_the_same_bits(small):
     assert len({(run.objective, run.iterations, run.overlap) for run in runs}) == 1
 
 
+def test_an_alignment_leaves_no_thread_behind(small):
+    before = threading.active_count()
+    align_mixtures(*small, disturbed())
+    assert threading.active_count() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+def test_a_forked_child_aligns_as_its_parent_did(small):
+    """A child of `fork` has none of its parent's threads: a pool that outlives the call would never answer it."""
+    parent = align_mixtures(*small, disturbed()).T_target_source.tobytes()
+    child = os.fork()
+    if not child:
+        signal.alarm(60)
+        os._exit(align_mixtures(*small, disturbed()).T_target_source.tobytes() != parent)
+    _, status = os.waitpid(child, 0)
+    assert status == 0, "the child hung, or found another pose"
+
+
 def test_views_that_share_nothing_have_no_pose(views):
     estimate = align_mixtures(*views, disturbed(twist=[0, 0, 0, 0, 1.5, 0]))
     assert estimate.status is Status.LOW_OVERLAP and not estimate.ok
@@ -123,7 +145,7 @@ def test_views_that_share_nothing_have_no_pose(views):
     assert estimate.overlap < 0.1 and "expected at least 10%" in estimate.reason
 
 
-def test_overlap_that_is_asked_for_is_needed(views):
+def test_less_overlap_than_required_is_no_pose(views):
     wanted = Config().replace({"alignment.min_overlap": 0.9})
     estimate = align_mixtures(*views, disturbed(), wanted)
     assert estimate.status is Status.LOW_OVERLAP and "share 78%" in estimate.reason
@@ -137,13 +159,13 @@ def test_few_components_seen_by_both_are_named_as_the_reason(small):
 
 
 def wide(neighbours=50, uncertainty=0.012):
-    """The default with more partners in the last rung: cut-off partner sets look like texture."""
+    """The default with more partners in the last rung, since cut-off partner sets look like texture."""
     ladder = (*LADDER[:-1], replace(LADDER[-1], neighbours=neighbours))
     return Config().replace({"alignment.ladder": ladder, "alignment.max_uncertainty": uncertainty})
 
 
 def test_a_wall_without_texture_leaves_its_plane_open(views):
-    """x, y and the turn about the normal are open; with texture or relief nothing is."""
+    """x, y and the turn about the normal are open, but not with relief."""
     loose = disturbed(twist=np.zeros(6), covariance=100 * FREE)
     wall = align_mixtures(*two_mixtures(surface=flat, colours=grey_at), loose, wide())
     relief = align_mixtures(*views, loose, wide())
@@ -166,13 +188,18 @@ def test_a_prior_twenty_sigmas_off_is_called_inconsistent(views):
     tight = np.diag([0.005**2] * 3 + [0.002**2] * 3)
     estimate = align_mixtures(*views, disturbed(twist=[0.1, 0, 0, 0, 0, 0], covariance=tight))
     assert estimate.status is Status.INCONSISTENT and not estimate.ok
-    assert "sigmas away from the initial pose (8 allowed)" in estimate.reason
+    assert "sigmas away from the start (8 allowed)" in estimate.reason
     near = align_mixtures(*views, disturbed(twist=[0.01, 0, 0, 0, 0, 0], covariance=tight))
     assert near.status is Status.CONVERGED
 
 
-def test_too_few_steps_are_said_to_be_too_few(views):
-    hasty = Config().replace({"alignment.ladder": (Rung(10.0, 2000, 12, 1),), "alignment.max_uncertainty": 1e6})
+def test_too_few_steps_are_reported(views):
+    hasty = Config().replace(
+        {
+            "alignment.ladder": (Rung(covariance_scale=10.0, components=2000, neighbours=12, steps=1),),
+            "alignment.max_uncertainty": 1e6,
+        }
+    )
     estimate = align_mixtures(*views, disturbed(), hasty)
     assert estimate.status is Status.MAX_ITERATIONS and "still moving after 1 step" in estimate.reason
     assert estimate.T_target_source is not None and not estimate.ok
@@ -180,26 +207,38 @@ def test_too_few_steps_are_said_to_be_too_few(views):
 
 @settings(max_examples=10)
 @given(SEEDS)
-def test_a_climb_never_goes_downhill(rung, seed):
-    """Of all the poses it tries it keeps the best, and that is not worse than the start."""
+def test_an_ascent_never_loses_value(rung, seed):
+    """It keeps the best of all poses that it tries, which is not worse than the start."""
     forward, backward, _ = rung
     start = random_pose(seed, 0.03) @ TRUTH
-    seen = []
+    tried = []
 
     def function(at):
-        seen.append(
-            ladder.posterior(ladder.two_way(forward, backward, at), at, WeightedStart(start, np.linalg.inv(FREE)), 60.0)
-        )
-        return seen[-1]
+        data = ladder.two_way(forward, backward, at, INLINE)
+        tried.append(ladder.posterior(data, at, WeightedStart(start, np.linalg.inv(FREE)), 60.0))
+        return tried[-1]
 
     end = ladder.ascend(function, State(start), 8, 1e-3)
-    values = [there.value for there in seen]
+    values = [there.value for there in tried]
     assert end.posterior.value == max(values) >= values[0]
-    assert len(seen) == end.iterations + 1 and (end.converged or end.iterations == 8)
+    assert len(tried) == end.iterations + 1 and (end.converged or end.iterations == 8)
 
 
-def test_a_climb_keeps_what_it_has_where_every_step_fails():
-    """A gradient that points the wrong way: no step is ever taken, and it does not loop for ever."""
+def test_an_optimum_reached_with_the_last_step_is_converged():
+    """On a parabola a single Newton step reaches the optimum, all but the damping."""
+
+    def function(at):
+        gradient = -np.append(np.zeros(6), at.errors)
+        return ladder.Posterior(-0.5 * float(at.errors @ at.errors), gradient, np.eye(8), None)
+
+    end = ladder.ascend(function, State(np.eye(4), np.ones(2)), 1, 0.01)
+    assert end.iterations == 1 and end.converged
+    assert not ladder.ascend(function, State(np.eye(4), np.ones(2)), 1, 1e-4).converged
+    assert not ladder.ascend(function, State(np.eye(4), np.ones(2)), 0, 0.01).converged
+
+
+def test_an_ascent_stays_where_every_step_fails():
+    """The gradient points the wrong way: every step is rejected, and the steps run out."""
 
     def function(at):
         r = se3_log(at.T)
@@ -221,9 +260,8 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 
     def at(twist):
         there = State(se3_exp(np.asarray(twist)) @ T)
-        return ladder.posterior(
-            ladder.two_way(forward, backward, there), there, WeightedStart(T_prior, precision), 60.0
-        )
+        data = ladder.two_way(forward, backward, there, INLINE)
+        return ladder.posterior(data, there, WeightedStart(T_prior, precision), 60.0)
 
     numeric = [(at(1e-5 * e).value - at(-1e-5 * e).value) / 2e-5 for e in np.eye(6)]
     gradient = at(np.zeros(6)).gradient
@@ -232,7 +270,7 @@ def test_gradient_of_the_posterior_is_that_of_central_differences(rung, seed):
 
 def test_information_of_the_posterior_is_the_data_s_plus_the_prior_s(rung):
     forward, backward, T = rung
-    data = ladder.two_way(forward, backward, State(T))
+    data = ladder.two_way(forward, backward, State(T), INLINE)
     alone = ladder.posterior(data, State(T), WeightedStart(T, np.zeros((6, 6))), 60.0)
     both = ladder.posterior(data, State(T), WeightedStart(T, np.linalg.inv(FREE)), 60.0)
     np.testing.assert_allclose(alone.information, 60 * ladder.curvature(data))
@@ -249,9 +287,9 @@ def test_inverse_left_jacobian_is_the_derivative_of_the_logarithm(seed):
 
 
 def test_curvature_lies_between_its_bounds(rung):
-    """And is the observed information itself where that is within them."""
+    """The curvature is the observed information itself where that lies within the bounds."""
     forward, backward, T = rung
-    data = ladder.two_way(forward, backward, State(T))
+    data = ladder.two_way(forward, backward, State(T), INLINE)
     L = np.linalg.inv(np.linalg.cholesky(data.information))
     shares = np.linalg.eigvalsh(L @ ladder.curvature(data) @ L.T)
     observed = np.linalg.eigvalsh(L @ data.observed @ L.T)
@@ -280,11 +318,11 @@ def test_a_precise_start_skips_the_wide_rungs(views):
 
 
 def test_the_last_rung_alone_does_not_find_the_way(views):
-    """What the ladder is for: from the same start the finest rung by itself ends further off."""
-    climbing = Config().replace({"alignment.guess_uncertainty": 1e6})  # a start this vague would be searched from
+    """From the same start, the finest rung by itself ends further off than the whole ladder."""
+    annealing = Config().replace({"alignment.guess_uncertainty": 1e6})  # or a start this vague would be searched from
     start = disturbed(twist=3 * DISTURBANCE, covariance=9 * FREE)
-    alone = align_mixtures(*views, start, climbing.replace({"alignment.ladder": LADDER[-1:]}))
-    whole = align_mixtures(*views, start, climbing)
+    alone = align_mixtures(*views, start, annealing.replace({"alignment.ladder": LADDER[-1:]}))
+    whole = align_mixtures(*views, start, annealing)
     assert off(whole.T_target_source, TRUTH)[0] < 1e-3 < off(alone.T_target_source, TRUTH)[0]
 
 

@@ -1,49 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is thought of a solution: every status with its reason, the gravest first, and one number for quality."""
+"""Verdicts: every status with its reason, the gravest first, and the quality as one number."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from candidates import SMALL, candidate
 from surfaces import TRUTH, disturbed, look, off, room
 
 from garps_core import Config, Mixture, Prior, Status, estimate_relative_pose
 from garps_core.config import Alignment
 from garps_core.geometry import ros_from_twist, se3_exp
-from garps_core.objective.brightness import BrightnessFit
-from garps_core.objective.shape import Evaluation
-from garps_core.solver.ladder import Solution, State
-from garps_core.verdict.status import Finding, quality, relative_uncertainty, verdict
+from garps_core.verdict.status import FIXED_STEPS_SUPPORT, quality, relative_uncertainty, verdict
 
 SETTINGS = Alignment()
-SMALL = np.diag([0.005**2] * 3 + [0.002**2] * 3)
 WIDE = np.diag([0.3**2] * 3 + [0.2**2] * 3)
 START = Prior(np.eye(4), WIDE, "identity")
 
 
-def finding(T=TRUTH, support=0.95, correlation=0.95, share=0.8, converged=True, covariance=SMALL, overlap=0.8):
-    """A solution that is fine unless told otherwise; correlation None = brightness is not known."""
-    data = Evaluation(3.0, np.zeros(6), np.eye(6), np.eye(6), support)
-    seen = None if correlation is None else BrightnessFit(T, covariance, correlation, share)
-    return Finding(Solution(State(T), None, 17, converged, 60.0, data), T, covariance, overlap, seen)
-
-
-def status_of(found, initial=START, guess=True, uncertainty=0.01, settings=SETTINGS):
-    status, reason = verdict(found, initial, guess, uncertainty, settings)
+def status_of(found, start=START, guess=True, uncertainty=0.01, settings=SETTINGS):
+    status, reason = verdict(found, start, guess, uncertainty, settings)
     assert reason and "\n" not in reason and not reason.endswith(".")
     return status, reason
 
 
-def test_what_is_fine_converged():
-    assert status_of(finding()) == (Status.CONVERGED, "converged in 17 steps, 0.7 sigmas from the initial pose")
+def test_a_good_candidate_has_converged():
+    assert status_of(candidate()) == (Status.CONVERGED, "converged in 17 steps, 0.7 sigmas from the start")
 
 
 def test_a_pose_far_from_its_start_is_inconsistent():
     tight = Prior(np.eye(4), WIDE / 400, "given")
-    status, reason = status_of(finding(), tight, guess=False)
+    status, reason = status_of(candidate(), tight, guess=False)
     assert status is Status.INCONSISTENT
-    assert reason == "the views pull 14.7 sigmas away from the initial pose (8 allowed)"
-    assert status_of(finding(), tight, False, settings=replace(SETTINGS, max_prior_sigmas=20.0))[0] is Status.CONVERGED
+    assert reason == "the views pull 14.7 sigmas away from the start (8 allowed)"
+    assert (
+        status_of(candidate(), tight, False, settings=replace(SETTINGS, max_prior_sigmas=20.0))[0] is Status.CONVERGED
+    )
 
 
 @pytest.mark.parametrize(
@@ -56,62 +48,66 @@ def test_a_pose_far_from_its_start_is_inconsistent():
     ],
 )
 def test_few_components_with_a_partner_are_a_poor_fit(guess, correlation, wanted):
-    """After a guess nearly all must have one, unless brightness is the witness."""
-    status, reason = status_of(finding(support=wanted - 0.01, correlation=correlation), guess=guess)
+    """After a guess nearly all must have one, unless brightness was compared."""
+    status, reason = status_of(candidate(support=wanted - 0.01, correlation=correlation), guess=guess)
     assert status is Status.POOR_FIT
     assert reason.startswith(f"{wanted - 0.01:.0%} of the components found a partner, expected {wanted:.0%} after")
     assert "(identity): possibly a wrong optimum, give a better prior" in reason
-    assert status_of(finding(support=wanted, correlation=correlation), guess=guess)[0] is Status.CONVERGED
+    assert status_of(candidate(support=wanted, correlation=correlation), guess=guess)[0] is Status.CONVERGED
 
 
 @pytest.mark.parametrize(("guess", "least"), [(True, SETTINGS.guess_correlation), (False, SETTINGS.min_correlation)])
-def test_brightness_that_disagrees_is_a_doubt(guess, least):
-    status, reason = status_of(finding(correlation=least - 0.19), guess=guess)
+def test_brightness_that_disagrees_is_a_poor_fit(guess, least):
+    status, reason = status_of(candidate(correlation=least - 0.19), guess=guess)
     assert status is Status.POOR_FIT
     wanted = f"brightness agrees to {least - 0.19:.2f} (correlation), expected {least:g} after this start (identity)"
     assert reason == f"{wanted}: possibly a wrong optimum, give a better prior"
-    assert status_of(finding(correlation=least), guess=guess)[0] is Status.CONVERGED
-    assert status_of(finding(correlation=None), guess=guess)[0] is Status.CONVERGED, "unknown is no doubt"
+    assert status_of(candidate(correlation=least), guess=guess)[0] is Status.CONVERGED
+    assert status_of(candidate(correlation=None), guess=guess)[0] is Status.CONVERGED, "nothing to compare"
 
 
-def test_a_direction_that_stays_open_is_degenerate():
-    status, reason = status_of(finding(), uncertainty=0.0712)
+def test_an_open_direction_is_degenerate():
+    status, reason = status_of(candidate(), uncertainty=0.0712)
     assert status is Status.DEGENERATE
     assert reason == "a direction stays open: scene points are uncertain by 7.1% of their range (5.0% allowed)"
-    assert status_of(finding(), uncertainty=0.0499)[0] is Status.CONVERGED
+    assert status_of(candidate(), uncertainty=0.0499)[0] is Status.CONVERGED
 
 
 def test_a_solution_that_still_moves_has_too_few_steps():
-    assert status_of(finding(converged=False)) == (Status.MAX_ITERATIONS, "still moving after 17 steps")
+    assert status_of(candidate(converged=False)) == (Status.MAX_ITERATIONS, "still moving after 17 steps")
 
 
 def test_the_gravest_comes_first():
-    """All at once; then one after the other is put right."""
+    """A candidate with every fault, which are put right one after the other."""
     bad = {"support": 0.1, "correlation": 0.1, "converged": False}
     tight, open_direction = Prior(np.eye(4), WIDE / 400, "given"), 0.2
-    order = [status_of(finding(**bad), tight, True, open_direction)]
+    order = [status_of(candidate(**bad), tight, True, open_direction)]
     for name, start, uncertainty in (("", START, 0.2), ("support", START, 0.2), ("correlation", START, 0.2)):
         bad.pop(name, None)
-        order.append(status_of(finding(**bad), start, True, uncertainty))
-    order.append(status_of(finding(converged=False), START, True, 0.01))
+        order.append(status_of(candidate(**bad), start, True, uncertainty))
+    order.append(status_of(candidate(converged=False), START, True, 0.01))
     assert [status.value for status, _ in order] == [
         "inconsistent", "poor_fit", "poor_fit", "degenerate", "max_iterations",
     ]  # fmt: skip
     assert "partner" in order[1][1] and "brightness" in order[2][1]
 
 
-def test_the_paper_s_solver_stops_after_its_steps_and_judges_nothing():
-    settings = Config.preset("paper").alignment
-    found = finding(support=0.1, correlation=-0.5, converged=False)
-    assert status_of(found, uncertainty=1.0, settings=settings) == (
-        Status.CONVERGED,
-        "the paper's fixed number of steps, 17",
-    )
+def test_a_fixed_number_of_steps_has_converged():
+    expected = "the paper's fixed number of steps, 17, 0.7 sigmas from the start"
+    assert status_of(candidate(fixed_steps=True)) == (Status.CONVERGED, expected)
 
 
-def test_merit_is_how_well_and_on_how_much_the_views_agree():
-    assert finding(correlation=0.9, share=0.5).merit == pytest.approx(0.45)
-    assert finding(correlation=None, overlap=0.4).merit == pytest.approx(3.0 * 0.4)
+@pytest.mark.parametrize(
+    ("fault", "start", "uncertainty", "status"),
+    [
+        ({}, Prior(np.eye(4), WIDE / 400, "given"), 0.01, Status.INCONSISTENT),
+        ({"correlation": 0.5}, START, 0.01, Status.POOR_FIT),
+        ({"support": FIXED_STEPS_SUPPORT - 0.01}, START, 0.01, Status.POOR_FIT),
+        ({}, START, 0.0712, Status.DEGENERATE),
+    ],
+)
+def test_a_fixed_number_of_steps_is_judged_as_any_other_solution(fault, start, uncertainty, status):
+    assert status_of(candidate(**fault, fixed_steps=True), start, uncertainty=uncertainty)[0] is status
 
 
 def test_relative_uncertainty_is_a_share_of_the_range():
@@ -140,7 +136,7 @@ WORSE = {
 @pytest.mark.parametrize("name", WORSE)
 @pytest.mark.parametrize("guess", [False, True])
 def test_quality_falls_with_everything_that_speaks_against_a_pose(name, guess):
-    good, worse = quality(finding(), guess), quality(finding(**WORSE[name]), guess)
+    good, worse = quality(candidate(), guess), quality(candidate(**WORSE[name]), guess)
     assert 0 <= worse < 0.6 * good and 0.5 < good <= 1
 
 
@@ -149,7 +145,7 @@ def test_quality_falls_with_everything_that_speaks_against_a_pose(name, guess):
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 def test_quality_is_a_number_from_0_to_1(correlation, support, scale):
     for guess in (False, True):
-        value = quality(finding(support=support, correlation=correlation, covariance=scale * SMALL), guess)
+        value = quality(candidate(support=support, correlation=correlation, covariance=scale * SMALL), guess)
         assert isinstance(value, float) and np.isfinite(value) and 0 <= value <= 1
 
 

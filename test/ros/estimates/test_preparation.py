@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Without depth topics: one pass of the network per frame, live as in a replay as offline; what is refused before."""
+"""Cameras without depth topics: the network runs once per frame, live and offline; wrong settings are refused."""
 
 import csv
 
@@ -15,12 +15,11 @@ from garps_core.config.text import changed_config
 from garps_core.errors import ConfigError, WeightsError
 from garps_core.models import depth_anything
 from garps_ros import replay
-from garps_ros.cameras import CameraTopics, Frame
 from garps_ros.estimates import preparation
 from garps_ros.estimates.outcomes import Origin
 from garps_ros.frames.assembly import DEPTH, IMAGE, Assembly
-from garps_ros.frames.frame import view_from_messages
-from garps_ros.live.estimator import Job, Solver
+from garps_ros.frames.frame import CameraTopics, Frame, view_from_messages
+from garps_ros.live.jobs import Job, JobRunner
 from garps_ros.parameters.settings import NodeSettings
 from msg_adapters import header_stamp_ns
 
@@ -40,14 +39,14 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def installed(weights, monkeypatch):
-    """The network is there, and looks at small pictures."""
+    """The network is installed, and takes small pictures."""
     monkeypatch.setenv("GARPS_WEIGHTS", str(weights))
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 140)
 
 
 @pytest.fixture
 def passes():
-    """How many pictures enter the network, pass by pass."""
+    """Number of pictures that enter the network, pass by pass."""
     entered = []
     network = shared().depth_network(CONFIG)
     hook = network.register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
@@ -88,11 +87,11 @@ def replayed(bag, out, *options):
 
 def followed():
     """Outcomes of a node that follows one camera: there and back again."""
-    solver = Solver(lambda _: None)
+    runner = JobRunner(lambda _: None)
     jobs = [
         Job((frame("source", i, look),), NodeSettings(pairing="keyframe"), CONFIG) for i, look in enumerate((0, 1, 0))
     ]
-    return [outcome for job in jobs for outcome in solver(job).outcomes]
+    return [outcome for job in jobs for outcome in runner(job).outcomes]
 
 
 def translation(row):
@@ -101,7 +100,7 @@ def translation(row):
 
 def test_a_pair_takes_one_pass_also_for_its_clouds(passes):
     frames = frame("source", 1, 0), frame("target", 1, 1)
-    result = Solver(lambda _: None)(Job(frames, NodeSettings(), CONFIG, clouds=True))
+    result = JobRunner(lambda _: None)(Job(frames, NodeSettings(), CONFIG, clouds=True))
     (outcome,) = result.outcomes
     assert (result.trace, outcome.row.status) == ("", "converged") and passes == [2]
     assert all(len(cloud.points) > 1000 for cloud in result.clouds)
@@ -155,7 +154,7 @@ WRONG = {
 def test_wrong_weights_are_found_before_the_first_pair(changes, kind, text):
     config = CONFIG.replace({f"reconstruction.{name}": value for name, value in changes.items()})
     with pytest.raises(kind) as caught:
-        Solver(lambda _: None).prepare(config)
+        JobRunner(lambda _: None).prepare(config)
     assert text in str(caught.value)
 
 
@@ -169,9 +168,9 @@ def test_settings_for_a_sensor_do_not_go_with_a_network():
 def test_a_sensor_needs_no_preparation_but_the_loops(monkeypatch):
     said = []
     monkeypatch.setattr(preparation, "LONG_S", -1.0)
-    solver = Solver(said.append)
-    solver.prepare(Config())
-    assert solver.scale == "the depth topics, m" and solver.stage == ""
+    runner = JobRunner(said.append)
+    runner.prepare(Config())
+    assert runner.scale == "the depth topics, m" and runner.stage == ""
     assert len(said) == preparation.compiled.AVAILABLE and all("compiled" in text for text in said)
 
 

@@ -87,7 +87,7 @@ def test_the_jitter_of_a_driver_is_no_loss(seed):
 
 
 def most_missing(stamps_s):
-    """The largest share that was ever said while these came in."""
+    """Return the largest share of missing messages reported while these came in."""
     arrivals, shares = Arrivals(), []
     for stamp in stamps_s:
         arrivals.note(float(stamp), START + round(stamp * SECOND), 0)

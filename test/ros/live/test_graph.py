@@ -2,7 +2,6 @@
 """The tools of the tests on a real graph do what those tests rely on."""
 
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -28,14 +27,12 @@ def domain(tmp_path):
         yield domain
 
 
-def test_two_peers_find_each_other_within_a_second(domain):
+def test_two_peers_find_each_other(domain):
     with Peer(domain, "one") as one, Peer(domain, "two") as two:
         publisher, heard = one.publisher(String, "words"), two.collect(String, "words")
-        began = time.monotonic()
         one.matched(publisher)
         publisher.publish(String(data="hello"))
         two.wait(lambda: heard, what="the word")
-        assert time.monotonic() - began < 1.0
         assert heard[0][1].data == "hello"
 
 
@@ -74,10 +71,7 @@ def test_a_node_that_hangs_is_killed_and_shown(domain, tmp_path):
     (tmp_path / "stubborn.py").write_text(STUBBORN)
     environment = domain.environment | {"PYTHONPATH": str(tmp_path)}
     node = NodeProcess([], environment, tmp_path / "log", module="stubborn")
-    began = time.monotonic()
-    while "up" not in node.log():
-        assert time.monotonic() - began < 20
-        time.sleep(0.05)
+    node.wait_for("up")
     node.signal(signal.SIGINT)
     with pytest.raises(pytest.fail.Exception, match=r"(?s)still runs 0.5 s.*I stay.*stubborn.py"):
         node.wait(0.5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live messages pair as a recording of them does; what is refused is said, and a jump back in time begins anew."""
+"""Live messages pair as in a recording of them; refused ones are reported; a jump back in time begins anew."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recordings import SECOND, START, write
 from ros_messages import camera_info, changed, image
 
-from garps_ros.cameras import CameraTopics
+from garps_ros.frames.frame import CameraTopics
 from garps_ros.frames.stamps import MAX_WAITING_LIVE, Pairer
 from garps_ros.live.intake import DEPTH, IMAGE, JUMP_BACK_NS, STUBBORN, Intake
 from garps_ros.recording.bags import Bag
@@ -117,7 +117,7 @@ OFFSETS = st.lists(st.integers(-30, 30), min_size=1, max_size=12)
 
 @given(OFFSETS, OFFSETS, OFFSETS, st.integers(0, 40))
 def test_frames_pair_by_the_rule_of_the_pairer(depths, partners, partner_depths, slop_ms):
-    """The same stamps through the intake and through the pairers of the replay by hand."""
+    """Return the pairs that the intake and the pairers of the replay make of the same stamps."""
     stamps = {(SOURCE, IMAGE): range(0, 50 * len(depths), 50), (SOURCE, DEPTH): [], (TARGET, IMAGE): []}
     stamps[SOURCE, DEPTH] = [50 * i + o // 2 for i, o in enumerate(depths)]
     stamps[TARGET, IMAGE] = [50 * i + o // 2 for i, o in enumerate(partners)]
@@ -230,7 +230,7 @@ def test_a_jump_back_begins_anew(back_ns, index, role):
     assert live.jumps[0].startswith((TOPICS[index].image, TOPICS[index].depth)[role] + ":")
     for other in {(i, r) for i in (SOURCE, TARGET) for r in (IMAGE, DEPTH)} - {(index, role)}:
         found += live.add(again, *other)
-    assert found == [(again, again)], "the message that jumped is the first of the new beginning"
+    assert found == [(again, again)], "the message that jumped is the first after it"
     assert live.pair(again + PERIOD) == [(again + PERIOD,) * 2]
     assert len(live.jumps) == 1 and live.refused == []
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pose_node as a process on a real graph: what goes in by topic comes out as the pose the offline path finds."""
+"""The process pose_node on a real graph: topics in, and out comes the pose that the offline path finds."""
 
 import numpy as np
 import pytest
 from graph import SECOND, room_pair
-from node_rig import CHEAP, EQUAL, NODE, Rig, assert_equal, count, finding, offline, running, values
+from node_rig import CHEAP, EQUAL, NODE, Rig, assert_equal, check, count, offline, running, values
 from places import DATA
 from ros_messages import ROS2
 
@@ -17,7 +17,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
-from garps_ros.live.publishing import message_class
+from garps_ros.live.publishers import message_class
 
 TRANSPORTS = {
     "raw_offered_reliable": ({"depth": "16UC1", "reliable": True}, ["image_qos=auto"]),
@@ -45,7 +45,7 @@ def test_two_cameras_give_the_offline_pose(domain, tmp_path, name):
         assert_equal(odometry, estimate)
         assert pose.header.frame_id == odometry.header.frame_id == "target_optical"
         assert odometry.child_frame_id == "source_optical"
-        level = finding(peer, "inputs", "all inputs arrive")
+        level = check(peer, "inputs", "all inputs arrive")
         assert level == 0
         if settings != ["image_qos=auto"] or not how["reliable"]:  # else both are right: it depends on what is lost
             expected = "RELIABLE" if "image_qos=reliable" in settings else "BEST_EFFORT"
@@ -145,7 +145,7 @@ def test_disabled_means_silent_and_lazy_means_idle(domain, tmp_path):
         rig.answer()
         assert peer.call(SetBool, f"{NODE}/enable", SetBool.Request(data=False)).success
         answered = len(rig.odometry)
-        finding(peer, "estimates", "disabled by ~/enable")
+        check(peer, "estimates", "disabled by ~/enable")
 
         def three_dropped() -> bool:
             rig.send()
@@ -159,7 +159,7 @@ def test_disabled_means_silent_and_lazy_means_idle(domain, tmp_path):
         for subscription in list(peer.node.subscriptions):
             if subscription.topic_name != "/diagnostics":
                 peer.node.destroy_subscription(subscription)
-        finding(peer, "estimates", "nobody subscribes")
+        check(peer, "estimates", "nobody subscribes")
         used = count(peer, "estimates", "poses used")
         rig.send()
         peer.wait(lambda: count(peer, "estimates", "dropped: nobody subscribes (lazy)"), what="a pair left alone")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node inside this process, with faults put into it: it says so, and goes on."""
+"""The node inside this process, with faults put into it: it reports them, and goes on."""
 
 import subprocess
 import sys
@@ -14,10 +14,10 @@ pytest.importorskip("rclpy")
 import rclpy
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
-from recordings import COVARIANCE, moved
+from recordings import COVARIANCE, answering, moved
 
 from garps_core.types import PoseEstimate, Status
-from garps_ros.live import estimator
+from garps_ros.live import jobs
 from garps_ros.live.node import PoseNode
 from msg_adapters import header_stamp_ns
 
@@ -75,7 +75,7 @@ class Inside:
         return self._stamp_ns
 
     def says(self, name, text, seconds=6):
-        """Wait until a status says a text; returns its level."""
+        """Wait until a status holds a text; return its level."""
         full = f"pose_node: {name}"
         self.peer.wait(lambda: text in self.peer.diagnostics().get(full, (0, "", {}))[1], seconds, f"{name}: {text!r}")
         return self.peer.diagnostics()[full][0]
@@ -83,7 +83,7 @@ class Inside:
 
 @pytest.fixture
 def estimates(monkeypatch):
-    """What the estimator does next: a function put in `estimates.next` is called once in its place."""
+    """The estimator's next answer: a function put in `estimates.next` is called once in its place."""
 
     class Estimates:
         next = None
@@ -93,7 +93,7 @@ def estimates(monkeypatch):
         found = PoseEstimate(Status.CONVERGED, "", moved(0.1), COVARIANCE, overlap=0.9) if fault is None else fault()
         return found, None
 
-    monkeypatch.setattr(estimator, "estimate_with_mixtures", estimate)
+    monkeypatch.setattr(jobs, "Estimator", answering(estimate))
     return Estimates
 
 
@@ -115,9 +115,7 @@ def test_a_dead_worker_is_an_error_and_is_replaced(domain, estimates):
         node.answer()
         estimates.next = die
         node.send()
-        began = time.monotonic()
         assert node.says("machine", "worker: ended by SystemExit: made to die; restarted") == 2
-        assert time.monotonic() - began < 4
         node.found.clear()
         node.answer()
         assert node.errors == []
@@ -180,16 +178,16 @@ def test_what_is_not_fit_to_use_is_not_published(domain, estimates, estimate, st
     with inside(domain) as node:
         node.answer()
         node.peer.spin(0.3)
-        before, used = len(node.found), node.node._health.used
+        before, used = len(node.found), node.node._counts.used
         estimates.next = estimate
         node.send()
         assert node.says("estimates", status) == 1
-        assert len(node.found) == before and node.node._health.used == used
-        assert node.node._health.rejected.total() == 1
+        assert len(node.found) == before and node.node._counts.used == used
+        assert node.node._counts.rejected.total() == 1
 
 
 def test_a_loop_that_stalls_ends_the_process_and_says_where():
-    """As when the call that takes a message never returns: nothing of Python runs then."""
+    """The call that takes a message may never return; nothing of Python runs then."""
     code = """if True:
         import time
         from garps_ros import pose_node
@@ -197,7 +195,7 @@ def test_a_loop_that_stalls_ends_the_process_and_says_where():
             def spin_once(self, timeout_sec):
                 stalled_in_here()
         class Node:
-            refusal = ""
+            start_error = ""
         def stalled_in_here():
             time.sleep(60)
         pose_node.STALL_S = 0.5

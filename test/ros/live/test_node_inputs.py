@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the running node says of its inputs: missing, lost, of another type or QoS, never together; and time."""
+"""The checks of a running node on its inputs: missing, lost, of another type or QoS, never together; and time."""
 
 import re
 
 import numpy as np
 import pytest
 from graph import SECOND
-from node_rig import Rig, finding, running, values
+from node_rig import Rig, check, running, values
 from ros_messages import image
 
 pytest.importorskip("rclpy")
@@ -19,7 +19,7 @@ def test_with_simulated_time_and_a_recording_that_begins_again(domain, tmp_path)
         rig = Rig(peer).ready()
         clock = peer.publisher(Clock, "/clock")
         peer.matched(clock)
-        assert finding(peer, "inputs", "nothing has come on /clock") == 2
+        assert check(peer, "inputs", "nothing has come on /clock") == 2
         start = 1_000 * SECOND
 
         def play(seconds):
@@ -37,22 +37,20 @@ def test_with_simulated_time_and_a_recording_that_begins_again(domain, tmp_path)
         for step in range(4):
             play(step + 0.5)
         peer.wait(lambda: rig.answers(start + round(3.5 * SECOND)), what="a pose after the jump back")
-        assert re.search(r"(went back|time went back) by .*beginning anew", node.log())
+        assert re.search(r"(went back|time went back) by .*starting anew", node.log())
         peer.wait(lambda: "went back" in values(peer, "estimates")["began anew"], what="the restart in the diagnostics")
 
 
 def test_wrong_qos_and_wrong_type_are_named(domain, tmp_path):
     with running(domain, tmp_path, ["image_qos=reliable"]) as (node, peer):
         Rig(peer, reliable=False)
-        assert finding(peer, "inputs", "peer offers BEST_EFFORT, image_qos asks for RELIABLE") == 2
+        assert check(peer, "inputs", "peer offers BEST_EFFORT, image_qos asks for RELIABLE") == 2
         text = "offers less RELIABILITY than image_qos:=reliable asks"
         peer.wait(lambda: text in node.log(), what="the event's line in the log")
     with running(domain, tmp_path) as (_, peer):
         peer.publisher(PointCloud2, "source/image")
         peer.publisher(PointCloud2, "source/depth")
-        assert (
-            finding(peer, "inputs", "peer publishes sensor_msgs/msg/PointCloud2, expected sensor_msgs/msg/Image") == 2
-        )
+        assert check(peer, "inputs", "peer publishes sensor_msgs/msg/PointCloud2, expected sensor_msgs/msg/Image") == 2
 
 
 @pytest.mark.parametrize("offered", ["RELIABLE", "BEST_EFFORT"])
@@ -80,8 +78,8 @@ def test_missing_inputs_are_named(domain, tmp_path):
         for _ in range(15):
             rig.send()
             peer.spin(0.1)
-        assert finding(peer, "inputs", "nothing received yet: source/depth (/front/depth, 0 publisher(s))") == 2
-        finding(peer, "inputs", "silent: ")
+        assert check(peer, "inputs", "nothing received yet: source/depth (/front/depth, 0 publisher(s))") == 2
+        check(peer, "inputs", "silent: ")
 
 
 def test_images_that_never_belong_together_are_explained(domain, tmp_path):

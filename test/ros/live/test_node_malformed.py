@@ -17,7 +17,7 @@ PoseWithCovarianceStamped = pytest.importorskip("geometry_msgs.msg").PoseWithCov
 
 
 class Trial:
-    """A node that has answered a first pair, its cameras, and what it says."""
+    """A node that has answered a first pair, its cameras, and its diagnostics."""
 
     def __init__(self, node: NodeProcess, peer: Peer, **how: str) -> None:
         self.node, self.peer = node, peer
@@ -39,7 +39,7 @@ class Trial:
         self.poses.clear()
 
     def complaints(self) -> dict[str, tuple[int, str]]:
-        """How many messages were refused and pairs rejected, and why last."""
+        """Number of messages refused and of pairs rejected, each with its last reason."""
         inputs, estimates = self.values("inputs"), self.values("estimates")
         rejected = sum(int(count) for name, count in estimates.items() if name.startswith("rejected: "))
         return {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""pose_node with two plain cameras: a network gives depth, and is there before the first pair; or the start ends."""
+"""The process pose_node with two plain cameras: a network is loaded before the first pair, or the start fails."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ import calm_network
 import numpy as np
 import pytest
 from graph import NodeProcess, room_pair
-from node_rig import Rig, assert_equal, finding, offline, running, values
+from node_rig import Rig, assert_equal, check, offline, running, values
 from places import ROOT
 from point_map_cases import Errors, point_maps, true_views
 from two_view_fixtures import RECORDED, installed_here, write_maps
@@ -41,7 +41,7 @@ def test_two_plain_images_give_the_offline_pose(networked, tmp_path, monkeypatch
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded depth_anything_v2 (weights {calm_network.NAME}) in " in node.log().split("ready")[0]
         shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert not {"source/depth", "target/depth"} & set(values(peer, "inputs"))
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
         assert values(peer, "machine")["scale from"] == f"depth_anything_v2 (weights {calm_network.NAME}), m"
@@ -57,7 +57,7 @@ def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
         before = node.log().split("ready")[0]
         assert "loaded demo_net (a demonstration: " in before and "demo_net is a demonstration: " in before
         shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"].startswith("demo_net (a demonstration: ")
     estimate = offline(shots, [], preset="demo_net")
     assert_equal(pose, estimate)
@@ -67,7 +67,7 @@ def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
 def test_weights_that_are_missing_end_the_start(domain, tmp_path):
     empty = with_weights(domain, tmp_path)
     node = NodeProcess(words(*NETWORK), empty.environment, tmp_path / "node.log")
-    assert node.wait(30) == 2, node.log()
+    assert node.wait() == 2, node.log()
     (line,) = [line for line in node.log().splitlines() if "error" in line]
     assert line.startswith("pose_node: error: no depth_anything weights in ")
     assert line.endswith(f"run `garps weights fetch {calm_network.NAME}`")
@@ -78,13 +78,10 @@ def test_a_signal_while_it_loads_and_compiles(networked, tmp_path):
     pytest.importorskip("numba")
     cold = with_weights(networked, networked.environment["GARPS_WEIGHTS"], NUMBA_CACHE_DIR=str(tmp_path))
     with NodeProcess(words(*NETWORK), cold.environment, tmp_path / "node.log") as node:
-        end = time.monotonic() + 30
-        while "loaded" not in node.log():
-            assert time.monotonic() < end, node.log()
-            time.sleep(0.05)
+        node.wait_for("loaded")
         time.sleep(0.3)
         node.signal(signal.SIGINT)
-        assert node.wait(5.0) == 0
+        assert node.wait() == 0
         assert "ready" not in node.log()
 
 
@@ -92,7 +89,7 @@ TWO_VIEW = ["reconstruction.method=two_view", "start.method=adapter"]
 
 
 def with_adapters(domain, folder):
-    """Of a package that is installed in the node's environment, next to the tests' own modules."""
+    """Return a domain whose environment has a package with adapters, next to the tests' own modules."""
     paths = [domain.environment["PYTHONPATH"], str(ROOT / "test" / "tools"), str(installed_here(folder))]
     return replace(domain, environment={**domain.environment, "PYTHONPATH": os.pathsep.join(paths)})
 
@@ -107,7 +104,7 @@ def test_an_adapter_gives_pose_and_depth_of_two_plain_images(domain, tmp_path, m
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded adapter {RECORDED} in " in node.log().split("ready")[0]
         shots, pose, odometry = Rig(peer, pair, depth="").ready().answer(60)
-        assert finding(peer, "inputs", "all inputs arrive") == 0
+        assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"] == f"adapter {RECORDED} of every pair, m"
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
     off = se3_log(pose_from_message(pose)[0] @ se3_inverse(pair.T_1_0))
@@ -122,7 +119,7 @@ def test_an_adapter_that_is_not_installed_ends_the_start(domain, tmp_path):
     node = NodeProcess(
         words("preset=monocular", *TWO_VIEW, "start.adapter=my_model"), domain.environment, tmp_path / "node.log"
     )
-    assert node.wait(30) == 2, node.log()
+    assert node.wait() == 2, node.log()
     (line,) = [line for line in node.log().splitlines() if "error" in line]
     assert line.startswith("pose_node: error: start.adapter is 'my_model': expected the name of an installed adapter")
     assert "Traceback" not in node.log() and "ready" not in node.log()
@@ -138,6 +135,6 @@ def test_an_adapter_that_is_not_installed_ends_the_start(domain, tmp_path):
 )
 def test_two_view_settings_that_cannot_be_end_the_start(domain, tmp_path, settings, message):
     node = NodeProcess(words(*settings), with_weights(domain, tmp_path).environment, tmp_path / "node.log")
-    assert node.wait(30) == 2, node.log()
+    assert node.wait() == 2, node.log()
     assert message in node.log()
     assert "Traceback" not in node.log() and "ready" not in node.log()

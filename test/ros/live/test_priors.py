@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Given poses: which belongs to an image, and which may not be used, with the reason."""
+"""Given poses: the choice of the one for an image, and the reasons why others are refused."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def kept(*stamps):
 
 
 def found(priors, stamp_ns, max_age_ns=AGE):
-    """Which of the messages it is, by its place; None when there is none."""
+    """Return the place of the message that is chosen; None when there is none."""
     posed = priors.near(stamp_ns, max_age_ns)
     return None if posed is None else int(posed.pose.pose.position.x)
 

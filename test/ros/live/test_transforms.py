@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms leave the tree whole: no second parent, no loop; without tf2_msgs the node says so once and works.
+"""Transforms leave the tree whole: no second parent, no loop; without tf2_msgs the node writes one line and works.
 
 tf2_msgs is part of ROS but of no package index, and a message class needs its compiled support. So its TFMessage and
 the topics that carry it are stand-ins of the same shape here; the transforms in it are real ones.
@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy
 from recordings import START, camera, moved
 from ros_messages import rclpy_class
 
-from garps_ros.live import estimator
+from garps_ros.live import jobs
 from garps_ros.live.intake import DEPTH, IMAGE
 from garps_ros.live.log import Log
 from garps_ros.live.node import PoseNode
@@ -108,7 +108,7 @@ def test_the_same_parent_by_somebody_else_is_a_second_answer(topics, transforms,
 
 @pytest.mark.parametrize(("topic", "stamp_ns"), [("/tf", START + 1), ("/tf_static", START)])
 def test_the_same_transform_as_ours_from_somebody_else_is_told_from_the_echo(topics, transforms, topic, stamp_ns):
-    """On /tf by its stamp; a latched one may well have the stamp of ours."""
+    """An echo on /tf is known by its stamp; a latched transform may have the same stamp as ours."""
     assert transforms.send(moved(0.25), START, "left", "right") == ""
     topics.other("left", "right", topic, stamp_ns)
     assert "already has the parent left" in transforms.send(moved(0.25), START + 2, "left", "right")
@@ -163,7 +163,7 @@ def test_a_loop_that_others_made_does_not_hang_us(topics, transforms):
     assert transforms.send(moved(0.25), START, "a", "c") == ""
 
 
-def test_the_refusal_is_written_once_and_not_with_every_pose(topics):
+def test_the_reason_is_written_once_and_not_with_every_pose(topics):
     lines = []
     log = Log(SimpleNamespace(warning=lines.append))
     transforms = Transforms(topics, PoseWriter(rclpy_class), partial(log.warn, "tf"))
@@ -206,7 +206,7 @@ def ros(monkeypatch, tmp_path):
 
 
 def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd):
-    monkeypatch.setattr(estimator, "estimate_with_mixtures", lambda *given: (recordings.estimate(*given), None))
+    monkeypatch.setattr(jobs, "Estimator", recordings.answering(recordings.estimate))
     node = PoseNode(ros)
     executor = SingleThreadedExecutor(context=ros.context)
     executor.add_node(ros)
@@ -218,10 +218,10 @@ def test_without_tf2_msgs_the_node_warns_once_and_works(ros, monkeypatch, capfd)
                 node._image(index, IMAGE, image)
                 node._image(index, DEPTH, depth)
             limit = time.monotonic() + 20
-            while node._health.used < frame and time.monotonic() < limit:
+            while node._counts.used < frame and time.monotonic() < limit:
                 executor.spin_once(timeout_sec=0.05)
-        assert node._health.used == 3 and not node._health.rejected and not node._health.errors
-        assert node._health.facts["transform"] == "off"
+        assert node._counts.used == 3 and not node._counts.rejected and not node._counts.errors
+        assert node._publishers.transform == "off"
     finally:
         assert node.stop(10)
         executor.shutdown()

@@ -3,6 +3,7 @@
 
 import dataclasses
 import inspect
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from garps_core.config.field import Checked, setting
 from garps_core.errors import ConfigError
 from garps_ros.estimates.keyframes import KeyframeRule
 from garps_ros.parameters import docs
-from garps_ros.parameters.parameter import parameters, settings_from
+from garps_ros.parameters.parameter import expert_settings, parameters, settings_from
 from garps_ros.parameters.settings import NodeSettings
 from garps_ros.replay import replay
 
@@ -44,26 +45,31 @@ def test_a_class_chooses_how_errors_name_its_settings() -> None:
         NodeSettings(pairing="x")
 
 
-def test_every_setting_is_a_parameter_except_the_ladders() -> None:
-    names = [parameter.name for parameter in parameters()]
+def test_every_setting_is_a_parameter_or_for_experts_except_the_ladders() -> None:
+    names, experts = ([p.name for p in some()] for some in (parameters, expert_settings))
     own = [f.name for f in dataclasses.fields(NodeSettings)]
-    assert names == own + [name for name in Config().settings() if name not in LADDERS]
-    assert names[0] == "preset" and len(names) == len(set(names))
+    assert names[: len(own)] == own and names[0] == "preset"
+    settings = [name for name in Config().settings() if name not in LADDERS]
+    assert [name for name in settings if name not in experts] == names[len(own) :]
+    assert [name for name in settings if name not in names] == experts
+    assert len(names) + 6 <= 45, "`ros2 param list` fills more than a screen"
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_defaults_are_those_of_the_preset(preset: str) -> None:
     declared = {parameter.name: parameter.default for parameter in parameters(preset)}
+    experts = {parameter.name: parameter.default for parameter in expert_settings(preset)}
     config = Config.preset(preset)
     assert {name: value for name, value in config.settings().items() if name not in LADDERS}.items() <= (
-        declared.items()
+        (declared | experts).items()
     )
     assert settings_from(declared) == (NodeSettings(preset=preset), config)
 
 
 def test_a_number_has_the_same_type_in_every_preset_and_a_range_that_holds_it() -> None:
     for preset in PRESETS:
-        for default, parameter in zip(parameters(), parameters(preset), strict=True):
+        ours = [*parameters(preset), *expert_settings(preset)]
+        for default, parameter in zip([*parameters(), *expert_settings()], ours, strict=True):
             assert type(parameter.default) is type(default.default), parameter.name
             assert parameter.doc, parameter.name
             if type(parameter.default) in (int, float):
@@ -82,8 +88,8 @@ def test_the_presets_named_are_those_that_exist() -> None:
 
 
 def test_what_cannot_change_while_the_node_runs() -> None:
-    fixed = {parameter.name for parameter in parameters() if not parameter.live}
-    expected = {"preset", "pairing", "image_transport", "depth_transport", "image_qos", "publish_tf"}
+    fixed = {parameter.name for parameter in [*parameters(), *expert_settings()] if not parameter.live}
+    expected = {"preset", "settings_file", "pairing", "image_transport", "depth_transport", "image_qos", "publish_tf"}
     networks = ("method", "depth_weights", "flash3d_weights", "scene", "semantics", "semantic_weights")
     expected |= {f"reconstruction.{name}" for name in (*networks, "semantic_backbone")}
     assert fixed == expected | {f"start.{name}" for name in ("method", "weights", "adapter")}
@@ -110,14 +116,18 @@ def test_the_node_and_the_replay_have_the_same_defaults(own: str, option: str) -
 
 
 def test_the_tracker_has_the_default_too() -> None:
-    assert KeyframeRule().lost_after == NodeSettings().keyframe_lost_after
+    rule, node = KeyframeRule(), NodeSettings()
+    assert rule.max_rotation_rad == math.radians(node.keyframe_rotation)
+    assert (rule.min_overlap, rule.max_motion_m) == (node.keyframe_overlap, node.keyframe_motion)
+    assert rule.lost_after == node.keyframe_lost_after
 
 
 def test_values_reach_the_settings() -> None:
     node, config = settings_from(values_of("paper", sync_slop=0.5, lifting__stride=7, device="cuda:0"))
     assert node.sync_slop == 0.5 and node.preset == "paper"
     assert config == Config.preset("paper").replace({"lifting.stride": 7, "device": "cuda:0"})
-    assert config.alignment.ladder == Config.preset("paper").alignment.ladder != Config().alignment.ladder
+    monocular = settings_from(values_of("monocular"))[1]
+    assert monocular.alignment.ladder == Config.preset("monocular").alignment.ladder != Config().alignment.ladder
 
 
 WRONG = {
@@ -130,9 +140,14 @@ WRONG = {
         "source_frame and target_frame are both 'cam': expected two names",
     ),
     "not a number": ({"max_rate": float("nan")}, "max_rate is nan: expected between 0 and 1000 Hz"),
-    "no part": ({"dtype": "float16"}, "dtype is 'float16': expected one of float32, float64"),
+    "no part": ({"device": 5}, "device is 5: expected text"),
     "text for flag": ({"lazy": "yes"}, "lazy is 'yes': expected True or False"),
     "unknown": ({"lifting__strid": 2}, "parameter 'lifting.strid' does not exist; did you mean 'lifting.stride'?"),
+    "expert": (
+        {"alignment__tolerance": 0.1},
+        "'alignment.tolerance' is an expert setting and no parameter of the node. Write `alignment.tolerance: 0.1`",
+    ),
+    "near an expert": ({"alignment__tolerence": 2}, "parameter 'alignment.tolerence' does not exist; did you mean 'al"),
     "ladder": ({"alignment__ladder": 2}, "parameter 'alignment.ladder' does not exist: it comes with the preset"),
     "far from all": ({"zzz": 2}, "parameter 'zzz' does not exist; `ros2 param list` shows all names"),
 }
@@ -200,15 +215,21 @@ def test_only_a_checkout_is_written_into(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_the_page_has_a_row_for_every_parameter() -> None:
     rows = [line for line in docs.page().splitlines() if line.startswith("| `")]
-    assert [row.split("`")[1] for row in rows] == [parameter.name for parameter in parameters()]
-    assert all(row.count(" | ") == 6 for row in rows)
+    names, experts = ([p.name for p in some()] for some in (parameters, expert_settings))
+    assert [row.split("`")[1] for row in rows] == names + experts
+    assert [row.count(" | ") for row in rows] == [6] * len(names) + [4] * len(experts)
     (row,) = [row for row in rows if "`lifting.noise_linear`" in row]
     expected = (
         "| `lifting.noise_linear` | double | `0.003`; time_of_flight `0.001`; structured_light `0.0`; stereo `0.0`;"
     )
     assert row.startswith(expected)
-    (row,) = [row for row in rows if "`alignment.max_prior_sigmas`" in row]
-    assert "`8.0`; paper `1000000.0`" in row
+    (row,) = [row for row in rows if "`alignment.effective_measurements`" in row]
+    assert "`30.0`; monocular `5.0`" in row
+
+
+def test_the_file_is_one_screen() -> None:
+    lines = docs.yaml_file().splitlines()
+    assert len(lines) <= 45 and max(map(len, lines)) <= 120
 
 
 @pytest.mark.parametrize(

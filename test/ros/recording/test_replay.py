@@ -24,7 +24,7 @@ from msg_adapters import pose_from_message, stamp_to_ns
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(replay, "estimate_relative_pose", recordings.estimate)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(recordings.estimate))
 
 
 def run(bag, out, *options):
@@ -137,7 +137,7 @@ def test_the_bag_is_one_that_jazzy_plays(tmp_path):
 
 
 def test_rejected_estimates_are_listed_but_not_published(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(replay, "estimate_relative_pose", functools.partial(recordings.estimate, bad={3, 5}))
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(functools.partial(recordings.estimate, bad={3, 5})))
     bag = write(tmp_path, "mcap", frames(["/left", "/right"], 6, "rosbags"))
     out = tmp_path / "out"
     assert run(bag, out) == 0
@@ -149,12 +149,12 @@ def test_rejected_estimates_are_listed_but_not_published(tmp_path, monkeypatch, 
 
 
 def test_a_pose_that_did_not_converge_is_in_the_table_only(tmp_path, monkeypatch):
-    def unsure(source, target, config):
+    def unsure(source, target, config, prior):
         return recordings.PoseEstimate(
             recordings.Status.DEGENERATE, "a wall", recordings.moved(0.1), recordings.COVARIANCE, overlap=0.5
         )
 
-    monkeypatch.setattr(replay, "estimate_relative_pose", unsure)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(unsure))
     out = tmp_path / "out"
     assert run(write(tmp_path, "mcap", frames(["/left", "/right"], 2, "rosbags")), out) == 1
     assert [(row["status"], float(row["tx"]), float(row["c00"])) for row in rows(out)] == [
@@ -165,7 +165,7 @@ def test_a_pose_that_did_not_converge_is_in_the_table_only(tmp_path, monkeypatch
 
 def test_a_covariance_that_lies_is_not_published(tmp_path, monkeypatch):
     lying = functools.partial(recordings.estimate, covariance=np.zeros((6, 6)))
-    monkeypatch.setattr(replay, "estimate_relative_pose", lying)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(lying))
     out = tmp_path / "out"
     assert run(write(tmp_path, "mcap", frames(["/left", "/right"], 2, "rosbags")), out) == 1
     assert {row["status"] for row in rows(out)} == {"not_publishable"}
@@ -174,9 +174,8 @@ def test_a_covariance_that_lies_is_not_published(tmp_path, monkeypatch):
 
 
 def test_a_bad_frame_does_not_break_the_path_and_being_lost_starts_a_new_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        replay, "estimate_relative_pose", functools.partial(recordings.estimate, bad={3, *range(6, 11)})
-    )
+    estimate = functools.partial(recordings.estimate, bad={3, *range(6, 11)})
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(estimate))
     out = tmp_path / "out"
     assert run(write(tmp_path, "mcap", frames(["/cam"], 13, "rosbags")), out) == 0
     np.testing.assert_allclose(trajectory(out)[:, 1], [0, 0.1, 0.3, 0.4], atol=1e-9)  # 3 is missing, 4 is right
@@ -195,12 +194,12 @@ CORE_ERRORS = {
 
 @pytest.mark.parametrize("status", CORE_ERRORS)
 def test_errors_of_the_core_are_rows(tmp_path, monkeypatch, status):
-    def failing(source, target, config):
+    def failing(source, target, config, prior):
         if recordings.index_of(source) == 2:
             raise CORE_ERRORS[status]
         return recordings.estimate(source, target)
 
-    monkeypatch.setattr(replay, "estimate_relative_pose", failing)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(failing))
     out = tmp_path / "out"
     assert run(write(tmp_path, "mcap", frames(["/cam"], 4, "rosbags")), out) == 0
     assert [row["status"] for row in rows(out)] == [status, "converged", "converged"]
@@ -327,11 +326,11 @@ import sys, time
 sys.path.insert(0, sys.argv.pop(1))
 import recordings
 from garps_ros import replay
-def slow(source, target, config):
+def slow(source, target, config, prior):
     print("estimating", flush=True)
     time.sleep(0.3)
     return recordings.estimate(source, target)
-replay.estimate_relative_pose = slow
+replay.Estimator = recordings.answering(slow)
 sys.exit(replay.main(sys.argv[1:]))
 """
 
@@ -339,7 +338,7 @@ sys.exit(replay.main(sys.argv[1:]))
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_replay_leaves_valid_results(tmp_path, number):
     bag, out = write(tmp_path, "mcap", frames(["/cam"], 60, "rosbags")), tmp_path / "out"
-    command = [sys.executable, "-c", SLOW, str(ROOT / "test"), str(bag), "--out", str(out)]
+    command = [sys.executable, "-c", SLOW, str(ROOT / "test" / "tools"), str(bag), "--out", str(out)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment

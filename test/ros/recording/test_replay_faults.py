@@ -13,7 +13,7 @@ from garps_ros.recording.outputs import Outputs
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(replay, "estimate_relative_pose", recordings.estimate)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(recordings.estimate))
 
 
 def run(bag, out, *options):
@@ -65,10 +65,10 @@ def test_results_are_closed_when_writing_fails(tmp_path, monkeypatch, capfd, err
 
 
 def test_a_programming_mistake_is_not_hidden_and_results_are_closed(tmp_path, monkeypatch):
-    def broken(source, target, config):
+    def broken(source, target, config, prior):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(replay, "estimate_relative_pose", broken)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(broken))
     with pytest.raises(ZeroDivisionError):
         run(write(tmp_path, "mcap", frames(["/left", "/right"], 2, "rosbags")), tmp_path / "out")
     assert (tmp_path / "out" / "poses" / "metadata.yaml").exists()
@@ -77,11 +77,11 @@ def test_a_programming_mistake_is_not_hidden_and_results_are_closed(tmp_path, mo
 def test_settings_reach_the_estimator(tmp_path, monkeypatch):
     seen = []
 
-    def noting(source, target, config):
+    def noting(source, target, config, prior):
         seen.append(config)
         return recordings.estimate(source, target)
 
-    monkeypatch.setattr(replay, "estimate_relative_pose", noting)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(noting))
     bag = write(tmp_path, "mcap", frames(["/cam"], 2, "rosbags"))
     changes = ("lifting.stride=4", "start.identity_fallback=false", "lifting.max_range_m=7", "device=cpu")
     options = [word for change in changes for word in ("--set", change)]

@@ -110,7 +110,7 @@ MISTAKES = {
     "setting of several numbers": (single_camera, ["--set", "alignment.ladder=1"], "cannot be set as text"),
     "setting yes": (single_camera, ["--set", "start.identity_fallback=yes"], "expected true or false"),
     "pairing": (single_camera, ["--pairing", "stereo"], "--pairing is 'stereo': expected one of auto, cameras"),
-    "rectified": (single_camera, ["--rectified", "yes"], "--rectified is 'yes': expected one of auto, true"),
+    "rectified": (single_camera, ["--rectified", "yes"], "--rectified is 'yes': expected one of auto, rectified, raw"),
     "slop": (single_camera, ["--slop", "-1"], "--slop"),
     "option": (single_camera, ["--sauce", "1"], "--sauce"),
 }

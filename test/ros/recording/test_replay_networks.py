@@ -44,7 +44,7 @@ def run(bag, folder, file, *more):
 
 
 def test_a_camera_without_depth_is_followed_by_an_adapter(tmp_path, monkeypatch, pair, capfd):
-    """A first view begins without depth, which it gets with the second; what the network does not know is a row."""
+    """A first view begins without depth, and gets it with the second; an unknown pair is a row with its reason."""
     monkeypatch.syspath_prepend(str(installed_here(tmp_path / "installed")))
     maps = point_maps(true_views(pair), pair.T_1_0, Errors(noise=0.005, patches=0.005, scale=0.03), seed=1)
     file = write_maps(tmp_path / "room.npz", (pair.rgb0, pair.rgb1, maps))

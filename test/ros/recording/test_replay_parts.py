@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import COVARIANCE, estimate, frames, moved, picture, write
+from recordings import COVARIANCE, answering, estimate, frames, moved, picture, write
 from ros_messages import LIBRARIES, camera_info, image
 from scipy.spatial.transform import Rotation
 
@@ -17,9 +17,8 @@ from garps_core.errors import InputError, ReconstructionError
 from garps_core.geometry import se3_inverse
 from garps_core.types import View
 from garps_ros import replay
-from garps_ros.cameras import CameraTopics
 from garps_ros.estimates.keyframes import KeyframeRule, KeyframeTracker, composed_covariance
-from garps_ros.frames.frame import frame_mismatch, view_from_messages
+from garps_ros.frames.frame import CameraTopics, frame_warning, view_from_messages
 from garps_ros.frames.stamps import MAX_WAITING, Pairer
 from garps_ros.recording.bags import BagError
 from garps_ros.recording.topics import choose_cameras
@@ -207,7 +206,7 @@ def view(index, share=1.0):
 
 
 def followed(tracker, views):
-    """For each view: "begins", "pose", "none" or the error."""
+    """Return one word per view: "begins", "pose", "none" or the error."""
     said = []
     for each in views:
         try:
@@ -245,7 +244,7 @@ def test_only_a_view_with_depth_begins_a_trajectory(blank):
 
 
 def test_a_hand_over_the_lens_does_not_end_the_trajectory():
-    """However long, also where it made usable views fail before."""
+    """A cover may last for any time, also where it made usable views fail before."""
     bad = {*range(3, 6), *range(10, 40)}
     tracker = KeyframeTracker(lambda s, t: estimate(s, t, bad=bad), KeyframeRule(max_motion_m=99, lost_after=3))
     hand = {4, *range(12, 40)}
@@ -266,7 +265,7 @@ def test_a_trajectory_begins_after_as_many_usable_views_as_asked_for(lost_after)
 
 @pytest.mark.parametrize(("lost_after", "segments"), [(2, 2), (3, 1)])
 def test_the_replay_is_told_after_how_many(tmp_path, monkeypatch, lost_after, segments):
-    monkeypatch.setattr(replay, "estimate_relative_pose", partial(estimate, bad=(3, 4)))
+    monkeypatch.setattr(replay, "Estimator", answering(partial(estimate, bad=(3, 4))))
     bag, out = write(tmp_path, "mcap", frames(["/cam"], 6, "rosbags")), tmp_path / "out"
     assert replay.main([str(bag), "--out", str(out), "--keyframe-lost-after", str(lost_after)]) == 0
     assert len(list(out.glob("trajectory*.tum"))) == segments
@@ -353,12 +352,12 @@ def test_a_view_is_undistorted_together_with_its_depth():
     assert np.isnan(made.depth[0, 0]) and made.depth[24, 32] == 1 and (made.rgb[0, 0] == 0).all()
 
 
-def test_a_view_without_depth_has_none_and_foreign_depth_or_calibration_is_doubted():
+def test_a_view_without_depth_has_none_and_foreign_depth_or_calibration_is_a_warning():
     rgb, depth = image(picture(3), "rgb8"), image(np.full((48, 64), 900, np.uint16), "16UC1", frame_id="ir")
     assert view_from_messages(rgb, camera_info())[0].depth is None
-    assert frame_mismatch(rgb, camera_info()) == ""
-    assert "depth is of frame 'ir', the image of 'cam'" in frame_mismatch(rgb, camera_info(), depth)
-    assert "camera_info is of frame 'other'" in frame_mismatch(rgb, camera_info(frame_id="other"))
+    assert frame_warning(rgb, camera_info()) == ""
+    assert "depth is of frame 'ir', the image of 'cam'" in frame_warning(rgb, camera_info(), depth)
+    assert "camera_info is of frame 'other'" in frame_warning(rgb, camera_info(frame_id="other"))
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_poses_of_an_rgbd_camera_are_those_of_its_ground_truth(tmp_path):
 
 
 def test_every_frame_of_an_rgbd_camera_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "estimate_relative_pose", recordings.estimate)
+    monkeypatch.setattr(replay, "Estimator", recordings.answering(recordings.estimate))
     assert replay.main([str(RGBD), "--out", str(tmp_path / "out")]) == 0
     found = rows(tmp_path / "out")
     assert len(found) == 11 and {row["status"] for row in found} == {"converged"}
