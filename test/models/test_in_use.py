@@ -18,7 +18,8 @@ from garps_core.mixtures.flash3d import labels_of, predict_gaussians
 from garps_core.mixtures.reconstruct import mixture_of, mixtures_of, reconstruct, with_depth
 from garps_core.mixtures.splat_writer import write_splats
 from garps_core.models import depth_anything
-from garps_core.models.flash3d import PADDED
+from garps_core.models.depth_anything import DepthAnythingV2
+from garps_core.models.flash3d import PADDED, Flash3D
 from garps_core.models.mask2former import Mask2Former
 from garps_core.models.semantics import segment
 
@@ -44,10 +45,6 @@ def installed(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 70)
 
 
-def networks() -> tuple[torch.nn.Module, torch.nn.Module]:
-    return shared().depth_network(FLASH3D), shared().flash3d(FLASH3D)
-
-
 def labelling(head: str, backbone: str = "") -> Config:
     return Config().replace({"reconstruction.semantics": head, "reconstruction.semantic_backbone": backbone})
 
@@ -55,8 +52,7 @@ def labelling(head: str, backbone: str = "") -> Config:
 def test_two_pictures_by_flash3d(files: dict[str, str], tmp_path: Path, capsys: Captured) -> None:
     """The parameters are pseudo-random: there is an answer, it says that it is none, and each network ran once."""
     extras = ["--json", "--figure", str(tmp_path / "pair.png"), "--ply", str(tmp_path / "splats")]
-    depth, gaussians = networks()
-    with passes(depth) as of_depth, passes(gaussians) as of_gaussians:
+    with passes(DepthAnythingV2) as of_depth, passes(Flash3D) as of_gaussians:
         code = command.main(["align", files["a"], files["b"], *K_WORDS, "--reconstruction", "flash3d", *extras])
     assert code == 1
     assert of_depth == [(2, 3, 70, 98)]
@@ -74,8 +70,7 @@ def test_two_pictures_by_flash3d(files: dict[str, str], tmp_path: Path, capsys: 
 
 def test_two_pictures_by_the_depth_network_alone(files: dict[str, str], capsys: Captured) -> None:
     """Without depth files the preset is monocular, and nothing else has to be said."""
-    depth, gaussians = networks()
-    with passes(depth) as of_depth, passes(gaussians) as of_gaussians:
+    with passes(DepthAnythingV2) as of_depth, passes(Flash3D) as of_gaussians:
         assert command.main(["align", files["a"], files["b"], *K_WORDS, "--json"]) in (0, 1)
     assert (of_depth, of_gaussians) == ([(2, 3, 70, 98)], [])
     out = json.loads(capsys.readouterr().out)
@@ -86,7 +81,7 @@ def test_two_pictures_by_the_depth_network_alone(files: dict[str, str], capsys: 
 def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captured) -> None:
     """The pose is near the truth even with pseudo-random offsets around the depth."""
     depths = ["--depth-source", files["a_mm"], "--depth-target", files["b_mm"]]
-    with passes(networks()[0]) as of_depth:
+    with passes(DepthAnythingV2) as of_depth:
         command.main(["align", files["a"], files["b"], *K_WORDS, *depths, "--reconstruction", "flash3d", "--json"])
     assert of_depth == []
     T = np.array(json.loads(capsys.readouterr().out)["T_target_source"])

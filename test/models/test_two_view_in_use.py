@@ -25,6 +25,7 @@ from garps_core.config.start import TWO_VIEW
 from garps_core.models import depth_anything, two_view_in_use
 from garps_core.models.mask2former import Mask2Former
 from garps_core.models.mast3r import NaverModel
+from garps_core.models.two_view import PatchEmbed
 from garps_core.weights.manifest import ALL, BY_NAME, SHARE_ALIKE
 from garps_core.weights.reader import read_tensors
 
@@ -104,8 +105,7 @@ NO_FIT = "trusted pixels fit one pose: expected at least 20%"
 @pytest.mark.parametrize("name", [MAST3R, PTH])
 def test_two_pictures_and_nothing_else(files: Files, name: str, capsys: Captured) -> None:
     """Depth of both views and a try at the pose from one look at the pair; both layouts say the same."""
-    network = shared().two_view(Config.preset("mast3r").replace({"start.weights": name})).network
-    with passes(network.patch_embed) as seen:
+    with passes(PatchEmbed) as seen:
         out = aligned(capsys, files, "--preset", "mast3r", *K_WORDS, *with_weights(f"weights={name}"))
         assert seen == [(2, 3, 96, 128)]
     assert out["status"] == "no_initial_pose"

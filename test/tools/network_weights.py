@@ -15,6 +15,7 @@ import torch
 from box_room import TRUTH, K, room
 from safetensors.torch import save_file
 from torch import nn
+from torch.nn.modules.module import register_module_forward_pre_hook
 
 from garps_core import View, align
 from garps_core.models.in_use import Networks
@@ -66,10 +67,15 @@ def shared() -> Networks:
 
 
 @contextmanager
-def passes(network: nn.Module) -> Iterator[list[tuple[int, ...]]]:
-    """Shapes of what enters the network, pass by pass."""
+def passes(network: type[nn.Module]) -> Iterator[list[tuple[int, ...]]]:
+    """Shapes of what enters networks of a class, pass by pass, whoever owns them."""
     seen: list[tuple[int, ...]] = []
-    hook = network.register_forward_pre_hook(lambda _module, given: seen.append(tuple(given[0].shape)))
+
+    def note(module: nn.Module, given: tuple[torch.Tensor, ...]) -> None:
+        if isinstance(module, network):
+            seen.append(tuple(given[0].shape))
+
+    hook = register_module_forward_pre_hook(note)
     try:
         yield seen
     finally:

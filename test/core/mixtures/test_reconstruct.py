@@ -70,7 +70,7 @@ def test_with_a_sensor_no_network_is_imported(preset: str, tmp_path: Path) -> No
 
 def test_both_views_share_one_pass_of_the_installed_network() -> None:
     views = pair()
-    with passes(network()) as seen:
+    with passes(depth_anything.DepthAnythingV2) as seen:
         found = with_depth(views, MONOCULAR)
     assert seen == [(2, 3, 70, 98)]
     expected = depth_of_images(network(), [view.rgb for view in views])
@@ -81,7 +81,7 @@ def test_both_views_share_one_pass_of_the_installed_network() -> None:
 
 def test_auto_asks_the_network_only_for_what_is_missing() -> None:
     bare, seen_by_sensor = pair()[0], pair(depth=True)[1]
-    with passes(network()) as seen:
+    with passes(depth_anything.DepthAnythingV2) as seen:
         first, second = with_depth([bare, seen_by_sensor], MONOCULAR)
     assert seen == [(1, 3, 70, 98)]
     assert first.depth is not None and second is seen_by_sensor

@@ -6,9 +6,9 @@ import csv
 import calm_network
 import numpy as np
 import pytest
-from network_weights import shared
 from recordings import PERIOD, START, write
 from ros_messages import camera_info, image
+from torch.nn.modules.module import register_module_forward_pre_hook
 
 from garps_core import Config, estimate_relative_pose
 from garps_core.config.text import changed_config
@@ -48,8 +48,12 @@ def installed(weights, monkeypatch):
 def passes():
     """Number of pictures that enter the network, pass by pass."""
     entered = []
-    network = shared().depth_network(CONFIG)
-    hook = network.register_forward_pre_hook(lambda _, given: entered.append(len(given[0])))
+
+    def note(module, given):
+        if isinstance(module, depth_anything.DepthAnythingV2):
+            entered.append(len(given[0]))
+
+    hook = register_module_forward_pre_hook(note)
     yield entered
     hook.remove()
 
