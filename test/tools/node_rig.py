@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from graph import SECOND, Camera, NodeProcess, Peer, room_pair
+from graph import PATIENCE_S, SECOND, Camera, NodeProcess, Peer, room_pair
 
 from garps_core import Config, Status, estimate_relative_pose
 from garps_core.config.text import changed_config
@@ -68,7 +68,7 @@ class Rig:
     def answers(self, stamp_ns):
         return [message for _, message in self.odometry if header_stamp_ns(message) == stamp_ns]
 
-    def answer(self, seconds=30.0):
+    def answer(self, seconds=PATIENCE_S):
         """Send pairs until one is answered; returns its shots, PoseStamped and Odometry.
 
         The first messages after a match may be lost, as on every graph; that is why pairs are sent again.

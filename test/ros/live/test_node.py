@@ -131,8 +131,8 @@ def test_a_changed_parameter_holds_from_the_next_pair_on(domain, tmp_path):
         shots, pose, _ = rig.answer()
         assert_equal(pose, offline(shots, ["lifting.stride=3"]))
         assert not np.allclose(pose_from_message(pose)[0], pose_from_message(before)[0], atol=EQUAL)
-        successful, reason = peer.set_parameter(NODE, "start.scale", "guess")
-        assert not successful and "expected one of auto, network, depth" in reason
+        successful, reason = peer.set_parameter(NODE, "rectified", "guess")
+        assert not successful and "expected one of auto, rectified, raw" in reason
         successful, reason = peer.set_parameter(NODE, "pairing", "keyframe")
         assert not successful
         shots, pose, _ = rig.answer()

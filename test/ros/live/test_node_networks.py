@@ -40,7 +40,7 @@ def test_two_plain_images_give_the_offline_pose(networked, tmp_path, monkeypatch
     with running(networked, tmp_path, NETWORK) as (node, peer):
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded depth_anything_v2 (weights {calm_network.NAME}) in " in node.log().split("ready")[0]
-        shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
+        shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer()
         assert check(peer, "inputs", "all inputs arrive") == 0
         assert not {"source/depth", "target/depth"} & set(values(peer, "inputs"))
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
@@ -56,7 +56,7 @@ def test_the_network_in_the_package_runs_live(domain, tmp_path, one_thread):
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         before = node.log().split("ready")[0]
         assert "loaded demo_net (a demonstration: " in before and "demo_net is a demonstration: " in before
-        shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer(60)
+        shots, pose, odometry = Rig(peer, room_pair(), depth="").ready().answer()
         assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"].startswith("demo_net (a demonstration: ")
     estimate = offline(shots, [], preset="demo_net")
@@ -103,7 +103,7 @@ def test_an_adapter_gives_pose_and_depth_of_two_plain_images(domain, tmp_path, m
     with running(adapting, tmp_path, ["preset=monocular", *settings]) as (node, peer):
         peer.wait(lambda: "ready" in node.log(), what="the node to be ready")
         assert f"loaded adapter {RECORDED} in " in node.log().split("ready")[0]
-        shots, pose, odometry = Rig(peer, pair, depth="").ready().answer(60)
+        shots, pose, odometry = Rig(peer, pair, depth="").ready().answer()
         assert check(peer, "inputs", "all inputs arrive") == 0
         assert values(peer, "machine")["scale from"] == f"adapter {RECORDED} of every pair, m"
         assert [peer.node.count_subscribers(f"/{side}/depth") for side in ("source", "target")] == [0, 0]
