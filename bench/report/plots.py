@@ -96,7 +96,7 @@ def error_against(rows: Sequence[Row], path: Path, of: str = "true_trans_m", err
 def time_against_error(rows: Sequence[Row], path: Path, error: str = "e_3d_m") -> Path:
     """A dot for each method: median seconds and median error over all pairs, both log.
 
-    Methods without a time, or of which half failed, have no dot, and their name says so.
+    Methods without a time, or of which half failed, have no dot; a note follows their name.
     """
     methods = _some(methods_of(rows), "rows")
     figure, axes = _figure(1)
