@@ -26,7 +26,7 @@ from rich.console import Console
 
 from bench.pairs import learned_rooms
 from bench.pairs.depths import DEMO_NET, config_of, with_depth_of
-from bench.pairs.pair import Pair, spread
+from bench.pairs.pair import Pair, evenly
 from bench.pairs.readers.pairs_json import DATA, available, load_pairs
 from bench.pairs.starts import disturbed_prior
 from bench.rows.depth_errors import depth_errors
@@ -91,7 +91,7 @@ def _median_e3d(pairs: Sequence[Pair], poses: Sequence[Any]) -> float:
 def picture(pairs: Sequence[Pair], network: DemoNet) -> npt.NDArray[np.uint8]:
     """A row per pair: photograph, true or sensor's depth, the network's, on one scale of colours; BGR."""
     rows = []
-    for pair in spread(list(pairs), PICTURES):
+    for pair in evenly(list(pairs), PICTURES):
         (ours,) = depth_of_views(network, [pair.source])
         top = float(np.nanquantile(_sensor(pair.source), 0.98)) * 1.2
         panels = [pair.source.rgb[..., ::-1], *(coloured(depth, top) for depth in (_sensor(pair.source), ours))]
@@ -144,7 +144,7 @@ def main(
     """Errors on real photographs, and time."""
     console, network = Console(soft_wrap=True), shipped()
     out.mkdir(parents=True, exist_ok=True)
-    generated = spread(learned_rooms.load("tune", rooms, console), PICTURES)
+    generated = evenly(learned_rooms.load("tune", rooms, console), PICTURES)
     cv2.imwrite(str(out / "rooms.png"), picture(generated, network))
     lines = [time_line([generated[0].source, generated[0].target], network), ""]
     pairs = [pair for name in available(data) for pair in load_pairs(name, data, limit)]

@@ -10,7 +10,7 @@ The best settings are written to --out as DEPTH.yaml: for `garps align --setting
 
 Settings are chosen on the dev half of recorded pairs and on the generated rooms to tune on (`bench.run --half dev`):
 sensor depth on recorded pairs, monocular depth on these and bare rooms, the demonstration network's on its own rooms.
-The held-out half and the other rooms are looked at once, by the report. A trial is worth the mean over all tables of
+The report looks at the held-out half and the other rooms once. The loss of a trial is the mean over all tables of
 
     log10(median E_3D) + log10(P90 E_3D) + share of failures        (beyond 25 cm or 5 deg; errors from 1 mm to 1 m)
 

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from bench.demo.bag import stamp_ns_of, write_bag
 from bench.demo.picture import with_inputs
 from bench.demo.rgb import rgb_part
-from bench.pairs.stereo import StereoPair, depth_of_both, load_pairs
+from bench.pairs.stereo import StereoPair, depth_of_both, load_stereo_pairs
 from bench.rooms import RoomPair, make_pair
 from garps_core import Config, PoseEstimate, Prior, View, estimate_relative_pose, metrics, reconstruct
 from garps_core.cli.figure import before_after
@@ -69,7 +69,7 @@ def main(
     """Run all parts; exit code 0 when the median baseline error is below the limit, offline and live."""
     begin = time.perf_counter()
     try:
-        load_pairs()
+        load_stereo_pairs()
     except FileNotFoundError as error:
         console.print(f"demo: error: {error}", style="red", soft_wrap=True)
         return 2
@@ -85,7 +85,7 @@ def main(
 def stereo_part(out: Path, scenes: int) -> bool:
     """Bag, replay, table, picture."""
     console.rule("Recorded stereo pairs: does the estimate find the calibrated baseline?")
-    pairs = load_pairs()[:scenes]
+    pairs = load_stereo_pairs()[:scenes]
     depths = [depth_of_both(pair) for pair in track(pairs, "stereo depth of both cameras", console=console)]
     for folder in ("bag", "replay"):
         shutil.rmtree(out / folder, ignore_errors=True)
@@ -246,7 +246,7 @@ def live_part(out: Path, scenes: int) -> bool:
     except LiveError as error:
         console.print(f"demo: error: {error}", style="red", soft_wrap=True)
         return False
-    return report_live(load_pairs()[:scenes], poses) and report_end(code)
+    return report_live(load_stereo_pairs()[:scenes], poses) and report_end(code)
 
 
 def report_live(pairs: list[StereoPair], poses: dict[int, LivePose]) -> bool:

@@ -76,7 +76,7 @@ def _pair(seed: int, level: int, source: View, target: View, T: Any, points: Any
     return Pair(SET, f"room{seed:04d}_level{level}", "small" if level <= 2 else "large", source, target, T, points)
 
 
-def matches(pair: Pair) -> int:
+def match_count(pair: Pair) -> int:
     """Mutual RootSIFT matches that pass the ratio test, as GARPS' own start finds them by default."""
     return len(match_features(pair.source, pair.target, Config().start))
 
@@ -148,7 +148,7 @@ def _cached(folder: Path, seed: int, level: int, width: int, height: int) -> Pai
         with np.load(path, allow_pickle=False) as file:
             return _read(path, file, seed, level, recipe)
     pair = room_pair(seed, level, width, height)
-    count = matches(pair)
+    count = match_count(pair)
     stored: dict[str, Any] = {"recipe": np.array(recipe), "matches": np.array(count)}
     if count < MAX_MATCHES:
         stored |= {name: np.asarray(getattr(pair.source, name)) for name in VIEW_ARRAYS}

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bench.machine.jobs import computed
-from bench.pairs.bare_rooms import matches
+from bench.pairs.bare_rooms import match_count
 from bench.pairs.pair import Pair, scene_points
 from bench.rooms import LEVELS, make_pair
 from bench.rooms.dark import in_the_dark
@@ -96,7 +96,7 @@ def _read(seed: int, path: Path) -> Pair:
 
 def few_matches(pairs: Sequence[Pair], limit: int) -> int:
     """Number of pairs with fewer feature matches than the limit."""
-    return sum(matches(pair) < limit for pair in pairs)
+    return sum(match_count(pair) < limit for pair in pairs)
 
 
 def main(

@@ -53,7 +53,7 @@ def rng_of(name: str, seed: int = 0) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(name.encode()), seed])
 
 
-def spread(items: list[Item], limit: int | None) -> list[Item]:
+def evenly(items: list[Item], limit: int | None) -> list[Item]:
     """Take at most `limit` items, spread evenly."""
     if limit is None or limit >= len(items):
         return items

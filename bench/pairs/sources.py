@@ -11,7 +11,7 @@ from rich.console import Console
 
 from bench.pairs import bare_rooms, learned_rooms
 from bench.pairs.depths import DEMO_NET, MONOCULAR, SENSOR
-from bench.pairs.pair import Pair, spread
+from bench.pairs.pair import Pair, evenly
 from bench.pairs.readers import READERS, load
 from bench.pairs.readers.pairs_json import DATA, HALVES, read_pairs
 
@@ -76,7 +76,7 @@ def pairs_of(source: str, limit: int | None, workers: int, console: Console, hal
     if name == ROOMS:
         return learned_rooms.load(split, path, console, workers, limit)
     if name == BARE:
-        return spread(bare_rooms.load_with_bar(split, path, console).pairs, limit)
+        return evenly(bare_rooms.load_with_bar(split, path, console).pairs, limit)
     skipped: list[str] = []
     found = load(name, path, limit, skipped)
     for text in skipped:

@@ -50,7 +50,7 @@ class StereoPair:
         return T
 
 
-def load_pairs() -> list[StereoPair]:
+def load_stereo_pairs() -> list[StereoPair]:
     """The twelve pairs, by name. Raises FileNotFoundError when stereodemo is not installed."""
     spec = importlib.util.find_spec("stereodemo")
     if spec is None or not spec.submodule_search_locations:

@@ -29,7 +29,7 @@ from bench.scoring.statistics import (
     median_of_all,
     methods_of,
     own_successes,
-    pair_of,
+    pair_key,
     rows_of,
     scale_sources,
     spread,
@@ -55,8 +55,8 @@ COMMON_SHARE = 0.5
 def paper_tables(rows: Sequence[Row]) -> str:
     """Every table, for each depth, set and start in order of first appearance."""
     text = []
-    for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
-        part = [row for row in rows if pair_of(row)[:3] == place]
+    for place in dict.fromkeys(pair_key(row)[:3] for row in rows):
+        part = [row for row in rows if pair_key(row)[:3] == place]
         part, without = _with_any_pose(part)
         shared, which = _common(part)
         tables = [mean_table(part), median_table(part), all_pairs_table(part)]
@@ -80,7 +80,7 @@ def _with_any_pose(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
 
 def _common(rows: Sequence[Row]) -> tuple[list[Row], str]:
     """The common subset of the methods that solve enough pairs, and what it is, in words."""
-    least = COMMON_SHARE * len({pair_of(row) for row in rows})
+    least = COMMON_SHARE * len({pair_key(row) for row in rows})
     able = [name for name in methods_of(rows) if sum(row["found"] for row in rows_of(rows, name)) >= least]
     out = [name for name in methods_of(rows) if name not in able]
     without = f", without {', '.join(out)}, which solved less than {100 * COMMON_SHARE:g} %" if out else ""
@@ -173,7 +173,7 @@ def length_table(rows: Sequence[Row], error: str = "e_3d_m", edges: Sequence[flo
     for low, high in pairwise(edges):
         if part := [row for row in known if low <= row["true_trans_m"] < high]:
             text = f"{low:g} to {high:g}" if high < INF else f"from {low:g}"
-            heading = f"{text} {length_unit(rows)} (n = {len({pair_of(row) for row in part})})"
+            heading = f"{text} {length_unit(rows)} (n = {len({pair_key(row) for row in part})})"
             columns[heading] = _column([median_of_all(rows_of(part, name), error) for name in names], _digits(error))
     caption = f"Median {_heading(error, rows)} by length of the true translation, over all pairs, failures at infinity"
     return _by_method(caption, known, columns) if columns else ""
@@ -217,7 +217,7 @@ def note(rows: Iterable[Row]) -> str:
     sets = dict.fromkeys(row["set"] for row in rows)
     sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
     scales = "; ".join(f"{name}: {', '.join(found)}" for name, found in sources.items())
-    text = f"Scale of the truth: {scales}. {len({pair_of(row) for row in rows})} pairs.{_points(rows)}"
+    text = f"Scale of the truth: {scales}. {len({pair_key(row) for row in rows})} pairs.{_points(rows)}"
     borrowed = [name for name in methods_of(rows) if name in LENGTH_FROM_DEPTH]
     return text + (f" Length of t from depth: {', '.join(borrowed)}." if borrowed else "")
 

@@ -18,7 +18,7 @@ from scipy.stats import binomtest, chi2
 
 from bench.rows.row import GARPS, START, Row
 from bench.scoring.scores import NAN
-from bench.scoring.statistics import errors_of, length_unit, median_of_all, methods_of, pair_of, rows_of, spread
+from bench.scoring.statistics import errors_of, length_unit, median_of_all, methods_of, pair_key, rows_of, spread
 from bench.scoring.summary import SUCCESS_DEG, SUCCESS_M, is_right
 from garps_core.checks import Float64Array
 
@@ -76,7 +76,7 @@ def error_against(rows: Sequence[Row], path: Path, of: str = "true_trans_m", err
         NothingToDraw: no row says it.
     """
     having = _some([row for row in rows if row.get(of) is not None], f"rows with {of}")
-    values = np.array([*{pair_of(row): round(row[of], 6) for row in having}.values()])  # equal lengths stay together
+    values = np.array([*{pair_key(row): round(row[of], 6) for row in having}.values()])  # equal lengths stay together
     bins = int(np.clip(len(values) // LEAST_IN_BIN, 1, BINS))
     edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))[1:-1]
     figure, axes = _figure(1)
@@ -96,7 +96,7 @@ def error_against(rows: Sequence[Row], path: Path, of: str = "true_trans_m", err
 def time_against_error(rows: Sequence[Row], path: Path, error: str = "e_3d_m") -> Path:
     """A dot for each method: median seconds and median error over all pairs, both log.
 
-    Methods without a time, or of which half failed, have no dot, and their name says so.
+    Methods without a time, or of which half failed, have no dot; a note follows their name.
     """
     methods = _some(methods_of(rows), "rows")
     figure, axes = _figure(1)
@@ -174,8 +174,8 @@ PLOTS: Mapping[str, Callable[[Sequence[Row], Path], Path]] = {
 def write_plots(rows: Sequence[Row], folder: Path) -> Iterator[Path]:
     """All plots that the rows have something for, of every depth, set and start, into a folder that is made."""
     folder.mkdir(parents=True, exist_ok=True)
-    for place in dict.fromkeys(pair_of(row)[:3] for row in rows):
-        part = [row for row in rows if pair_of(row)[:3] == place]
+    for place in dict.fromkeys(pair_key(row)[:3] for row in rows):
+        part = [row for row in rows if pair_key(row)[:3] == place]
         able = {row["method"] for row in part if row["found"]}
         part = [row for row in part if row["method"] in able]
         for name, draw in PLOTS.items():

@@ -18,7 +18,7 @@ from bench.report.paper_tables import paper_tables
 from bench.report.plots import write_plots
 from bench.report.run_tables import print_tables, write
 from bench.rows.row import GARPS, START, Row
-from bench.scoring.statistics import pair_of
+from bench.scoring.statistics import pair_key
 from garps_core import Config, reconstruct
 from garps_core.cli.figure import before_after
 
@@ -71,18 +71,18 @@ def write_pictures(
 ) -> Iterator[Path]:
     """The pair of median error of every table, at the start and as GARPS leaves it; at most `MAX_PICTURES`."""
     of_pair = {(pair.set, pair.id): pair for pair in pairs}
-    starts = {pair_of(row): row for row in rows if row["method"] == START and row["found"]}
-    own = [row for row in rows if row["method"] == GARPS and row["found"] and pair_of(row) in starts]
-    tables = list(dict.fromkeys(pair_of(row)[:3] for row in own))
+    starts = {pair_key(row): row for row in rows if row["method"] == START and row["found"]}
+    own = [row for row in rows if row["method"] == GARPS and row["found"] and pair_key(row) in starts]
+    tables = list(dict.fromkeys(pair_key(row)[:3] for row in own))
     for table in tables[:MAX_PICTURES]:
-        chosen = sorted((row for row in own if pair_of(row)[:3] == table), key=lambda row: float(row["e_3d_m"]))
+        chosen = sorted((row for row in own if pair_key(row)[:3] == table), key=lambda row: float(row["e_3d_m"]))
         row = chosen[len(chosen) // 2]
         if (pair := of_pair.get((row["set"], row["pair"]))) is None:
             continue
         out.mkdir(parents=True, exist_ok=True)
         seen = with_depth_of(pair, row["depth"], seed)
         mixtures = [reconstruct(view, configs[row["depth"]]) for view in (seen.source, seen.target)]
-        start = starts[pair_of(row)]
+        start = starts[pair_key(row)]
         title = (
             f"{row['set']}, {row['pair']}, depth {row['depth']}, start {row['start']}: E_3D {start['e_3d_m']:.4f} m "
             f"before, {row['e_3d_m']:.4f} m after"

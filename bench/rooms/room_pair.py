@@ -169,7 +169,7 @@ class _Look:
         self.kinds = len(np.unique(labels))
 
     def quality(self) -> float:
-        """1 or more when the view is worth having: nothing in front of the lens, and more than bare walls."""
+        """1 or more when nothing stands in front of the lens and the view holds more than bare walls."""
         near, middle = (float(v) for v in np.nanquantile(self.depth, (0.04, 0.5)))
         return min(near / 0.7, middle / 1.5, self.furnished / 0.35, self.kinds / 5, 5.0 / middle)
 

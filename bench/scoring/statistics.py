@@ -50,7 +50,7 @@ class AllPairs(NamedTuple):
     maa: float
 
 
-def pair_of(row: Row) -> PairKey:
+def pair_key(row: Row) -> PairKey:
     """The table and pair of a row."""
     return row.get("depth", ""), row["set"], row["start"], row["pair"]
 
@@ -122,11 +122,11 @@ def common_subset(rows: Sequence[Row], methods: Iterable[str] | None = None) -> 
     solved: dict[PairKey, set[str]] = {}
     for row in rows:
         if row["found"]:
-            solved.setdefault(pair_of(row), set()).add(row["method"])
-    return [row for row in rows if row["method"] in chosen and chosen <= solved.get(pair_of(row), set())]
+            solved.setdefault(pair_key(row), set()).add(row["method"])
+    return [row for row in rows if row["method"] in chosen and chosen <= solved.get(pair_key(row), set())]
 
 
 def matched(rows: Sequence[Row], ours: str, theirs: str) -> list[tuple[Row, Row]]:
     """The rows of two methods, pair by pair, of the pairs that both were run on."""
-    others = {pair_of(row): row for row in rows_of(rows, theirs)}
-    return [(row, others[pair_of(row)]) for row in rows_of(rows, ours) if pair_of(row) in others]
+    others = {pair_key(row): row for row in rows_of(rows, theirs)}
+    return [(row, others[pair_key(row)]) for row in rows_of(rows, ours) if pair_key(row) in others]

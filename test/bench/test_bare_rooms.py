@@ -60,7 +60,7 @@ def test_pairs_are_kept_on_disk_and_stay_the_same(small_split, tmp_path):
     first = bare_rooms.load(small_split, tmp_path, lambda *counts: shown.append(counts), WIDTH, HEIGHT)
     assert [pair.id for pair in first.pairs] == ["room0020_level1", "room0021_level2"]
     assert shown[-1] == (2, 2)
-    assert all(bare_rooms.matches(pair) < bare_rooms.MAX_MATCHES for pair in first.pairs)
+    assert all(bare_rooms.match_count(pair) < bare_rooms.MAX_MATCHES for pair in first.pairs)
     (tmp_path / "room0021_level2.npz").unlink()  # as after an interruption
     kept = (tmp_path / "room0020_level1.npz").stat().st_mtime_ns
     again = bare_rooms.load(small_split, tmp_path, width=WIDTH, height=HEIGHT)

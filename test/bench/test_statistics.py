@@ -15,7 +15,7 @@ from bench.scoring.statistics import (
     median_of_all,
     methods_of,
     own_successes,
-    pair_of,
+    pair_key,
     rows_of,
     scale_sources,
     spread,
@@ -129,9 +129,9 @@ def test_pairs_of_different_tables_are_not_the_same(key: str) -> None:
 
 def test_a_row_that_does_not_say_its_depth_is_of_none() -> None:
     row = made_row("a", "p1", 1.0, depth="sensor", set="s", start="features")
-    assert pair_of(row) == ("sensor", "s", "features", "p1")
+    assert pair_key(row) == ("sensor", "s", "features", "p1")
     del row["depth"]
-    assert pair_of(row) == ("", "s", "features", "p1")
+    assert pair_key(row) == ("", "s", "features", "p1")
 
 
 def test_matched_rows_are_of_pairs_that_both_ran_on_failures_too() -> None:

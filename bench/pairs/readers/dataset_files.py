@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bench.pairs.pair import Pair, scene_points, spread
+from bench.pairs.pair import Pair, evenly, scene_points
 from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.geometry import so3_log
 from garps_core.types import View
@@ -68,14 +68,14 @@ def gathered(candidates: list[Candidate], layout: str, limit: int | None, skippe
     if not candidates:
         raise ValueError(f"no pairs found: expected {layout}")
     if skipped is None:
-        candidates = spread(candidates, limit)
+        candidates = evenly(candidates, limit)
     absent = [[file for file in candidate.files if not file.is_file()] for candidate in candidates]
     if skipped is None and any(absent):
         raise MissingFiles([file for files in absent for file in files], layout)
     if skipped is not None:
         skipped += [f"{pair.id}: {gone[0]}" for pair, gone in zip(candidates, absent, strict=True) if gone]
     there = [candidate for candidate, gone in zip(candidates, absent, strict=True) if not gone]
-    return [candidate.make() for candidate in spread(there, limit)]
+    return [candidate.make() for candidate in evenly(there, limit)]
 
 
 def require(layout: str, *files: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.pairs.pair import Pair, scene_points, spread
+from bench.pairs.pair import Pair, evenly, scene_points
 from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.types import View
 
@@ -57,7 +57,7 @@ def read_pairs(name: str, folder: Path, limit: int | None = None, half: str = "a
     """The pairs of a folder with a `pairs.json`. Raises as `load_pairs`."""
     records = json.loads((folder / "pairs.json").read_text())["pairs"]
     chosen = ids_of_half([record["id"] for record in records], half)
-    records = spread([record for record in records if record["id"] in chosen], limit)
+    records = evenly([record for record in records if record["id"] in chosen], limit)
     return [_pair(name, folder, record) for record in records]
 
 
