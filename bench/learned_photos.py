@@ -137,7 +137,7 @@ def _seconds(what: Callable[[], Any]) -> float:
 
 def main(
     data: Annotated[Path, typer.Option(help="folder that holds dev/<set>/pairs.json")] = DATA,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set")] = None,
+    limit: Annotated[int | None, typer.Option(help="largest number of pairs of a set")] = None,
     rooms: Annotated[Path, typer.Option(help="folder of the generated pairs, for the time")] = learned_rooms.FOLDER,
     out: Annotated[Path, typer.Option(help="folder of table and pictures")] = Path("out/learned_photos"),
 ) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far two runs of `bench.run` differ on the pairs that both hold, by method: nothing, if all is as it should be.
+"""Differences of two runs of `bench.run` on the pairs that both hold, by method: none, if all is well.
 
 python -m bench.run --limit 5 --out out/again
 python -m bench.repeat out/run out/again
@@ -21,7 +21,7 @@ from bench.rows.row_log import ROWS, key_of
 
 
 class Differences(NamedTuple):
-    """Of a method: answers that both runs hold, those that only one has a pose for, largest difference of a number."""
+    """Answers of a method that both runs hold, those with a pose in one run only, largest difference of a number."""
 
     answers: int
     one_sided: int

@@ -65,7 +65,7 @@ class Job:
 
     @property
     def keys(self) -> list[Key]:
-        """Of its rows."""
+        """Keys of its rows."""
         return [(self.depth, self.pair.set, start, self.pair.id) for start in self.starts]
 
 
@@ -120,7 +120,7 @@ def main(
         list[str] | None, typer.Option(help='setting of GARPS, as "alignment.effective_measurements=100"')
     ] = None,
     limit: Annotated[
-        int | None, typer.Option(help="at most so many pairs of a set: spread evenly, of learned rooms the first")
+        int | None, typer.Option(help="largest number of pairs of a set: spread evenly, of learned rooms the first")
     ] = None,
     half: Annotated[
         str, typer.Option(help=f"of each pairs.json: {', '.join(HALVES)}; dev takes generated rooms to tune on")

@@ -41,9 +41,9 @@ RATE, DECAY = 2e-3, 1e-2
 WARM_UP = 300
 """Steps of a rising rate, which then falls as a cosine to nothing."""
 AVERAGE = 0.998
-"""Of the running mean of the weights, per step."""
+"""Decay of the running mean of the weights, per step."""
 SLOPES_WEIGHT = 0.5
-"""Of the differences between neighbours, against that of the values."""
+"""Weight of the differences between neighbours, against that of the values."""
 SAVE_EVERY = 200
 
 
@@ -119,7 +119,7 @@ class Training:
 
 
 def folded(network: DemoNet) -> DemoNet:
-    """The same function without batch norms."""
+    """An equal network without batch norms."""
     plain = copy.deepcopy(network).eval()
     for unit in [module for module in plain.modules() if isinstance(module, Unit)]:
         unit[0], unit[1] = fuse_conv_bn_eval(unit[0], unit[1]), nn.Identity()

@@ -71,14 +71,14 @@ SPACES: dict[str, dict[str, tuple[float, float]]] = {
         "lifting.patch_sigma": (0.05, 0.6),
     },
 }
-"""What is searched, all on a logarithmic scale: few settings, so that half of the pairs can decide about them."""
+"""Ranges that are searched, all on a logarithmic scale: few settings, so that half of the pairs can decide."""
 TUNED_ON = {SENSOR: (PAIRS,), MONOCULAR: (PAIRS, BARE), DEMO_NET: (ROOMS,)}
 """Kinds of sources that decide about a depth."""
 SMALLEST_M, LARGEST_M = 1e-3, 1.0
 
 
 def loss_of(tables: Sequence[Sequence[Row]]) -> float:
-    """What a trial is worth (module docstring), less is better. Rows are those of GARPS, a table at a time."""
+    """The loss of a trial (module docstring), less is better. Rows are those of GARPS, a table at a time."""
     inside = [row["nees"] < CHI2_6_95 for rows in tables for row in rows if "nees" in row]
     missed = max(0.0, abs(float(np.mean(inside)) - 0.95) - 0.025) if inside else 1.0
     return float(np.mean([_table_loss(rows) for rows in tables])) + missed / 0.05
@@ -115,7 +115,7 @@ def _pairs(depth: str, source: str, half: str, limit: int | None) -> list[Pair]:
 
 
 def search(study: optuna.Study, planned: Sequence[Part], trials: int, console: Console) -> None:
-    """Run so many trials more; the first of a study is the preset as it is."""
+    """Run this many more trials; the first of a study is the preset as it is."""
     depth = planned[0].depth
     preset = config_of(depth)
     if not _completed(study):
@@ -179,9 +179,9 @@ def planned_parts(depth: str, sources: Sequence[str], limit: int | None) -> list
 
 def main(
     depth: Annotated[str, typer.Option(help=f"which preset: {', '.join(SPACES)}")] = SENSOR,
-    trials: Annotated[int, typer.Option(help="so many more; 0 = only report")] = 40,
+    trials: Annotated[int, typer.Option(help="number of further trials; 0 = only report")] = 40,
     data: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER, as of bench.run; repeat at will")] = None,
-    limit: Annotated[int | None, typer.Option(help="at most so many pairs of a set, as of bench.run")] = None,
+    limit: Annotated[int | None, typer.Option(help="largest number of pairs of a set, as of bench.run")] = None,
     out: Annotated[Path, typer.Option(help="folder of the study; one that is there goes on")] = Path("out/tune"),
 ) -> None:
     """Choose settings on one half of the pairs, report on the other."""
@@ -200,8 +200,8 @@ def main(
     for name, value in study.best_params.items():
         console.print(f"  {name} = {value:.4g}   (preset: {Config.preset(depth).settings()[name]:g})")
     chosen = out / f"{depth}.yaml"
-    remark = f"Best of {len(study.trials)} trials of python -m bench.tune --depth {depth}: loss {study.best_value:.4f}"
-    write_settings(chosen, depth, study.best_params, remark)
+    comment = f"Best of {len(study.trials)} trials of python -m bench.tune --depth {depth}: loss {study.best_value:.4f}"
+    write_settings(chosen, depth, study.best_params, comment)
     console.print(f"settings: {chosen}")
     console.print(report(study, planned, console))
 

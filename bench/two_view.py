@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a two-view network costs on this machine's CPU, stage by stage, for one pair of pictures.
+"""Cost of a two-view network on this machine's CPU, stage by stage, for one pair of pictures.
 
     python -m bench.two_view [--size full|small] [--head mast3r|dust3r|linear] [--runs 3] [--threads 2]
 
@@ -77,7 +77,7 @@ def measured(name: str, call: Call, runs: int) -> Row:
 
 
 def counted(row: Row, call: Call) -> Row:
-    """The same line with its operations; counting them keeps intermediate results, so it comes after every peak."""
+    """A line with its operations; counting them keeps intermediate results, so it comes after every peak."""
     with torch.inference_mode():
         flop = counted_flop(call) / 1e9
     return row | {"GFLOP": flop, "GFLOP per CPU s": flop / row["CPU s"]}

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator
 
@@ -20,14 +19,13 @@ from garps_core.geometry import Array, ros_from_twist, twist_from_ros
 from garps_core.objective.brightness import fit_brightness
 from garps_core.objective.pairs import overlap, to_device
 from garps_core.objective.state import WeightedStart
-from garps_core.solver import ladder, paper
 from garps_core.solver.ladder import MIN_ROWS, Solution
+from garps_core.solver.methods import METHODS
 from garps_core.solver.problem import Problem
-from garps_core.solver.search import search
 from garps_core.start.initialise import identity
 from garps_core.types import Mixture, PoseEstimate, Prior, Status
 from garps_core.verdict.candidate import Candidate, best_candidate
-from garps_core.verdict.covariance import inflated, pose_covariance, share_of_known
+from garps_core.verdict.covariance import inflated, pose_covariance, share_of_start
 from garps_core.verdict.status import quality, relative_uncertainty, verdict
 
 SEARCHED_SIGMAS = 3.0
@@ -122,7 +120,7 @@ def _aligned(source: Mixture, target: Mixture, start: Prior, config: Config) -> 
     guess = relative_uncertainty(source, weighted.T, start.covariance) > settings.guess_uncertainty
     with ThreadPoolExecutor(1) as pool:
         problem = Problem(to_device(source, config), to_device(target, config), weighted, config, pool, guess)
-        candidates = (_candidate(solution, problem) for solution in _maximise(config, guess)(problem))
+        candidates = (_candidate(solution, problem) for solution in METHODS[config.method](problem))
         best = best_candidate(candidates, settings)
     if best is None:
         return _low_overlap(overlap(problem.source, problem.target, weighted.T, settings), start, settings)
@@ -144,13 +142,6 @@ def _aligned(source: Mixture, target: Mixture, start: Prior, config: Config) -> 
     )
 
 
-def _maximise(config: Config, guess: bool) -> Callable[[Problem], Iterable[Solution]]:
-    """Return the function that finds solutions: the paper's, one ladder from the start, or a search around a guess."""
-    if config.alignment.solver == "adam":
-        return paper.maximise
-    return search if guess else ladder.anneal
-
-
 def _low_overlap(shared: float, start: Prior, settings: Alignment) -> PoseEstimate:
     reason = f"the views share {shared:.0%} of their components, expected at least {settings.min_overlap:.0%}"
     if shared >= settings.min_overlap:  # then the solver gave up
@@ -162,7 +153,7 @@ def weighted_start(start: Prior, config: Config) -> WeightedStart:
     """Return the start pose as a measurement and, where they are solved for, the usual size of depth errors."""
     precision = np.linalg.inv(twist_from_ros(start.covariance, start.T_target_source))
     of_errors = np.zeros(0)
-    if config.alignment.depth_errors and config.alignment.solver != "adam":
+    if config.solves_depth_errors:
         of_errors = np.tile(1 / np.maximum(error_sigmas(config.lifting)[:DEPTH_MODES], 1e-6) ** 2, 2)
     return WeightedStart(start.T_target_source, np.asarray(precision, np.float64), of_errors)
 
@@ -179,7 +170,7 @@ def _candidate(solution: Solution, problem: Problem) -> Candidate:
     if fit is not None and settings.brightness_measurements > 0:
         T, covariance, kept = fit.T, ros_from_twist(fit.covariance, fit.T), fit.kept
     if config.lifting.sigma_inflation > 1:
-        of_start = ros_from_twist(kept @ share_of_known(solution, problem.start) @ kept.T, T)
+        of_start = ros_from_twist(kept @ share_of_start(solution, problem.start) @ kept.T, T)
         covariance = inflated(covariance, of_start, config.lifting.sigma_inflation)
     return Candidate(solution, T, _with_common_scale(covariance, T, config), overlap(x, y, T, settings), fit)
 

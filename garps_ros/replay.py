@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from garps_core.align import Estimator
 from garps_core.config import PRESETS, Config, methods
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.errors import GarpsError
 from garps_core.models.depth_networks import preset_for
 from garps_core.models.in_use import Networks
@@ -103,6 +103,13 @@ Exit code: 0 = at least one pose, 1 = no pose, 2 = wrong input, 130 = interrupte
 With --to-ros: 0 = played to the end, 1 = no message could be sent, 2 = wrong input, 130 = interrupted.
 """
 
+Rectified = Annotated[str, typer.Option(help="Kind of the images: rectified, raw, or auto (by topic name).")]
+KeyframeOverlap = Annotated[float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)]
+KeyframeMotion = Annotated[float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)]
+KeyframeRotation = Annotated[float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)]
+LostAfter = Annotated[
+    int, typer.Option(help="New trajectory after this number of frames in a row without a pose.", min=1, max=1000)
+]
 Preset = Annotated[str | None, typer.Option(help=f"One of {', '.join(PRESETS)}. [default; with a network monocular]")]
 Reconstruction = Annotated[
     str | None, typer.Option(help=f"Whose depth, one of {', '.join(methods()[:-1])}. [auto: the depth topics]")
@@ -137,21 +144,11 @@ def replay(
     slop: Annotated[
         float, typer.Option(help="Largest difference of stamps that belong together, seconds.", min=0, max=10)
     ] = NodeSettings.sync_slop,
-    rectified: Annotated[
-        str, typer.Option(help="Kind of the images: rectified, raw, or auto (by topic name).")
-    ] = NodeSettings.rectified,
-    keyframe_overlap: Annotated[
-        float, typer.Option(help="New keyframe when the overlap is below.", min=0, max=1)
-    ] = NodeSettings.keyframe_overlap,
-    keyframe_motion: Annotated[
-        float, typer.Option(help="New keyframe beyond this distance, metres.", min=0)
-    ] = NodeSettings.keyframe_motion,
-    keyframe_rotation: Annotated[
-        float, typer.Option(help="New keyframe beyond this rotation, degrees.", min=0)
-    ] = NodeSettings.keyframe_rotation,
-    keyframe_lost_after: Annotated[
-        int, typer.Option(help="New trajectory after this number of frames in a row without a pose.", min=1, max=1000)
-    ] = NodeSettings.keyframe_lost_after,
+    rectified: Rectified = NodeSettings.rectified,
+    keyframe_overlap: KeyframeOverlap = NodeSettings.keyframe_overlap,
+    keyframe_motion: KeyframeMotion = NodeSettings.keyframe_motion,
+    keyframe_rotation: KeyframeRotation = NodeSettings.keyframe_rotation,
+    keyframe_lost_after: LostAfter = NodeSettings.keyframe_lost_after,
     limit: Annotated[int | None, typer.Option(help="Stop after this many pairs.", min=1)] = None,
     preset: Preset = None,
     reconstruction: Reconstruction = None,
@@ -195,15 +192,9 @@ def replay(
 def _configured(preset: str | None, method: str | None, file: Path | None, changes: list[str]) -> Config:
     """Return the settings; where no preset is given, those of a network start from the preset for its depth."""
     changes = [*changes, *([f"reconstruction.method={method}"] if method else [])]
-
-    def changed(base: Config) -> Config:
-        return changed_config(base if file is None else read_settings(file, base, preset), changes)
-
-    if preset is None:
-        asked = changed(Config())
-        config = changed(Config.preset(preset_for(asked.reconstruction.method, needs_depth(asked))))
-    else:
-        config = changed(Config.preset(preset))
+    config = configured(
+        preset, file, changes, lambda asked: preset_for(asked.reconstruction.method, needs_depth(asked))
+    )
     check_method(config)
     return config
 

@@ -47,7 +47,7 @@ LIMIT_MM = 5.0
 PICTURE = "bedroom_chair"
 ROOM_SEED, ROOM_LEVEL = 3, 4
 ROUGH_M, ROUGH_DEG = 0.12, 3.0
-"""How far the room's rough start is off."""
+"""Error of the room's rough start."""
 
 Array = npt.NDArray[np.float64]
 console = Console()
@@ -64,7 +64,7 @@ class Estimate:
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the bag, poses.csv and the pictures.")] = Path("out/demo"),
-    scenes: Annotated[int, typer.Option(help="Use the first so many stereo pairs.", min=1)] = 12,
+    scenes: Annotated[int, typer.Option(help="Number of stereo pairs, from the first on.", min=1)] = 12,
 ) -> int:
     """Run all parts; exit code 0 when the median baseline error is below the limit, offline and live."""
     begin = time.perf_counter()

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 UInt8 = npt.NDArray[np.uint8]
 
 WIDTH = 1400
-"""Of the finished picture, pixels."""
+"""Width of the finished picture, px."""
 COLOURS = 256
 """A palette keeps the file below 400 kB."""
 MARGIN, CAPTION = 24, 40

@@ -23,7 +23,7 @@ from garps_core.models.demo_net import WHAT_IT_IS, depth_of_views, shipped
 
 ROOM_SEED, ROOM_LEVEL = 12, 3
 LIMIT = 0.15
-"""Of the scene-point error, over the median distance of the scene: beyond, the demo fails."""
+"""Largest scene-point error, over the median distance of the scene, with which the demo succeeds."""
 
 
 def rgb_part(out: Path, console: Console) -> bool:
@@ -60,7 +60,7 @@ def written(pair: RoomPair, out: Path) -> list[str]:
 
 
 def depth_line(pair: RoomPair) -> str:
-    """How wrong the depth of both views is."""
+    """Errors of the depth of both views."""
     views = View(pair.rgb0, pair.K0), View(pair.rgb1, pair.K1)
     found = zip(depth_of_views(shipped(), views), (pair.true_depth0, pair.true_depth1), strict=True)
     errors = [100 * depth_errors(ours, true).abs_rel for ours, true in found]

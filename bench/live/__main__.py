@@ -35,7 +35,10 @@ from bench.rooms import RoomPair, make_pair
 from msg_adapters import ns_to_stamp, stamp_to_ns
 
 ROOM_SEED, ROOM_LEVEL = 3, 2
-SLOW = "lifting.stride: 1\nalignment.solver: adam\n"
+SLOW = (
+    "lifting.stride: 1\nmethod: paper\npaper.steps: 8\npaper.neighbours: 20\n"
+    "paper.opacity_threshold: 0.0\npaper.component_stride: 1\n"
+)
 """Settings under which a pair of 640x480 takes 1.5 s and more on two cores; nobody would want them."""
 CHEAP = "lifting.stride: 8\nstart.max_features: 300\n"
 """Settings under which the estimate takes little beside what is measured."""
@@ -47,7 +50,7 @@ console = Console()
 
 @dataclass
 class Answers:
-    """What has come from the node."""
+    """Messages that have come from the node."""
 
     poses_s: dict[int, float] = field(default_factory=dict)
     """Arrival (steady time, s) by stamp, ns."""

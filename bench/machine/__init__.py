@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What depends on the machine: its facts, the cost of a call, jobs on several processes."""
+"""Facts of the machine, the cost of a call, jobs on several processes."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the networks cost on this machine's CPU, and how close they come to its own matrix multiplication.
+"""Cost of the networks on this machine's CPU, and how close they come to its own matrix multiplication.
 
     python -m bench.networks [--only depth-anything,flash3d] [--sizes vits,vitb,vitl] [--runs 5] [--threads 2]
 
@@ -31,7 +31,7 @@ from bench.networks.pair import pair_lines
 from bench.report.checks import Check, Row, Section, markdown, print_section
 
 BAR_SHARE = 0.5
-"""Of the multiplication's throughput: the least that the default depth network must reach on two images."""
+"""Least share of the multiplication's throughput that the default depth network must reach on two images."""
 MATRIX = 2048
 """Rows and columns of the multiplied matrices."""
 MULTIPLICATIONS = 4
@@ -40,7 +40,7 @@ MULTIPLICATIONS = 4
 
 @dataclass(frozen=True)
 class Case:
-    """One line of the table: a network of one size on so many images of one size."""
+    """One line of the table: a network of one size on images of one size."""
 
     network: str
     size: str

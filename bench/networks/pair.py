@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the time of a whole pair goes that comes without depth: both depths, mixtures, start, alignment.
+"""Time of each stage of a whole pair that comes without depth: both depths, mixtures, start, alignment.
 
 The weights are random, so the depth network computes all it has to, and then its output is replaced by a generated
 room's depth as such a network gives it. Otherwise the other stages would have nothing to work on. Flash3D keeps its own
@@ -35,10 +35,12 @@ ROOM = 3
 """Seed of the room; its views are 0.25 m and 10 degrees apart."""
 
 
-def install(folder: Path) -> None:
-    """Random weights of both networks, where GARPS looks for them from now on."""
-    made = {"depth-anything-v2-indoor-small": DepthAnythingV2("vits", 20.0), "flash3d": Flash3D()}
-    for name, network in made.items():
+def install(folder: Path, method: str) -> None:
+    """Put random weights of the networks that a method needs where GARPS looks for them from now on."""
+    networks: dict[str, torch.nn.Module] = {"depth-anything-v2-indoor-small": DepthAnythingV2("vits", 20.0)}
+    if method == "flash3d":
+        networks["flash3d"] = Flash3D()
+    for name, network in networks.items():
         torch.save(network.state_dict(), folder / BY_NAME[name].local)
     os.environ["GARPS_WEIGHTS"] = str(folder)
 
@@ -66,7 +68,7 @@ def measured_pair(method: str, runs: int, threads: int) -> Row:
     config = Config.preset("monocular").replace({"reconstruction.method": method})
     found: list[PoseEstimate] = []
     with tempfile.TemporaryDirectory() as folder:
-        install(Path(folder))
+        install(Path(folder), method)
         NETWORKS.depth_network(config).register_forward_hook(answering((pair.depth0, pair.depth1)))
 
         def call() -> None:

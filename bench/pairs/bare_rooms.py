@@ -38,7 +38,7 @@ VIEW_ARRAYS = ("rgb", "K", "depth")
 
 @dataclass(frozen=True)
 class Split:
-    """Which seeds a split may take, and how many pairs of each level it keeps."""
+    """Seeds that a split may take, and the number of pairs of each level that it keeps."""
 
     seeds: range
     per_level: int
@@ -136,7 +136,7 @@ def load(
 
 
 def _recipe(width: int, height: int) -> str:
-    """What decides about a pair besides its seed and level; change `VERSION` with the rooms themselves."""
+    """All that decides about a pair besides its seed and level; change `VERSION` with the rooms themselves."""
     settings = (VERSION, MAX_MATCHES, EXPOSURE, BLUR_PX, WHITE_ELECTRONS, READ_ELECTRONS, GAMMA, width, height)
     return " ".join(map(str, settings))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whose depth a pair gets: the set's own, the same spoilt, or a network's."""
+"""Depth for a pair: the set's own, the same spoilt, or a network's."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from garps_core.types import View
 
 SENSOR, MONOCULAR, DEMO_NET = "sensor", "monocular", "demo_net"
 DEPTHS = {SENSOR: "sensor", MONOCULAR: "monocular", **presets()}
-"""Whose depth: the set's own, the same spoilt as a network would, or a network's; and the preset that goes with it."""
+"""Kinds of depth and their presets: the set's own, the same spoilt as by a network, or a network's."""
 
 
 def usable(pair: Pair, depth: str) -> bool:
@@ -67,7 +67,7 @@ def with_monocular_depth(pair: Pair, seed: int = 0) -> Pair:
 
 
 def why_not(depth: str) -> str:
-    """Why a network of `DEPTHS` cannot run here, or nothing."""
+    """The reason that a network of `DEPTHS` cannot run here, or "" where it can."""
     if depth in (SENSOR, MONOCULAR):
         return ""
     try:
@@ -86,7 +86,7 @@ def overlap_of(pair: Pair) -> float | None:
 
 
 def without_depth(pairs: Sequence[Pair], depth: str) -> list[str]:
-    """What cannot be run with a depth, in words."""
+    """Sets that cannot be run with a depth, in words."""
     lacking = [pair for pair in pairs if not usable(pair, depth)]
     counts = {name: sum(pair.set == name for pair in lacking) for name in dict.fromkeys(pair.set for pair in lacking)}
     return [f"{name}, depth {depth}: {n} pairs come without it for both views" for name, n in counts.items()]

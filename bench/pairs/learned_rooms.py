@@ -54,7 +54,7 @@ def load(split: str, folder: Path, console: Console, workers: int = 2, limit: in
     if split not in SPLITS:
         raise ValueError(f"split is {split!r}: expected one of {', '.join(SPLITS)}")
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = list(SPLITS[split])[:limit]  # levels and kinds take turns, so that any beginning holds all of them
+    seeds = list(SPLITS[split])[:limit]  # levels and kinds take turns, so that the first few hold all of them
     with Progress(console=console) as bars:
         paths = computed(partial(stored, folder=folder), seeds, workers)
         return [
@@ -95,7 +95,7 @@ def _read(seed: int, path: Path) -> Pair:
 
 
 def few_matches(pairs: Sequence[Pair], limit: int) -> int:
-    """How many have fewer matches of features than that."""
+    """Number of pairs with fewer feature matches than the limit."""
     return sum(matches(pair) < limit for pair in pairs)
 
 

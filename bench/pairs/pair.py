@@ -54,7 +54,7 @@ def rng_of(name: str, seed: int = 0) -> np.random.Generator:
 
 
 def spread(items: list[Item], limit: int | None) -> list[Item]:
-    """At most `limit` of them, spread evenly."""
+    """Take at most `limit` items, spread evenly."""
     if limit is None or limit >= len(items):
         return items
     return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the pairs of a run come from, whose depth they get, and from which starts they are run by default."""
+"""Sources of the pairs of a run, with the depths and starts that each is run with by default."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BY_DEFAULT: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def sources_there(data: Path = DATA) -> list[str]:
-    """What a run takes by default: every set beside the repository with depth in its pairs.json, generated rooms."""
+    """Sources of a run by default: every set beside the repository with depth in its pairs.json, generated rooms."""
     found = sorted(path for path in (data / "dev").glob("*/pairs.json") if _have_depth(path))
     return [
         *(f"{PAIRS}={os.path.relpath(path.parent)}" for path in found),
@@ -59,7 +59,7 @@ def pairs_of(source: str, limit: int | None, workers: int, console: Console, hal
 
     Args:
         source: NAME=FOLDER.
-        limit: at most so many, spread evenly; of learned rooms the first.
+        limit: largest number of pairs, spread evenly; of learned rooms the first.
         workers: processes that make rooms.
         console: for bars, and what is left out.
         half: of a folder with a pairs.json; of generated rooms "dev" takes those to tune on, else those to report.

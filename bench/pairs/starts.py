@@ -14,7 +14,7 @@ from garps_core.types import Prior
 DISTURBANCE_M = 0.12
 DISTURBANCE_DEG = 1.0
 NOMINAL_RANGE_M = 3.0
-"""Where the centre of a scene is taken to lie on the optical axis when nothing is known of its points."""
+"""Distance, on the optical axis, of the centre of a scene whose points are unknown."""
 
 
 def disturbed(T: Float64Array, scene_points: Float64Array, rng: np.random.Generator) -> Float64Array:

@@ -28,7 +28,10 @@ RELAXED = {
     "abs_pose_min_num_inliers": 10,
     "filter_min_tri_angle": 0.1,
 }
-"""Of the mapper: for baselines that are short against the depth. The defaults ask for 16 deg, 100, 30 and 1.5 deg."""
+"""Settings of the mapper for baselines that are short against the depth.
+
+The defaults are 16 deg, 100, 30 and 1.5 deg.
+"""
 CENTRE = 0.5
 """COLMAP's pixel coordinates of the centre of the first pixel."""
 

@@ -38,7 +38,7 @@ class Result(NamedTuple):
 
 Method = Callable[[View, View, Float64Array | None], Result]
 NO_ANSWER = (Failure, GarpsError, RuntimeError, ValueError, np.linalg.LinAlgError, cv2.error, ModuleNotFoundError)
-"""What methods raise on pairs that they can do nothing with, or where their library is not installed."""
+"""Exceptions of methods on pairs that they can do nothing with, or where their library is not installed."""
 FROM_A_START: dict[str, Callable[[View, View, Float64Array], Float64Array]] = {
     "open3d-gicp": registration.open3d_gicp,
     "open3d-colored": registration.open3d_colored,

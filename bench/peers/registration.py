@@ -24,16 +24,16 @@ Levels = tuple[tuple[float, float], ...]
 LEVELS: Levels = ((0.08, 0.5), (0.04, 0.25), (0.02, 0.1))
 """(voxel, correspondence distance) in m, coarse to fine: the most accurate."""
 FAST_LEVELS: Levels = ((0.08, 0.5), (0.06, 0.25), (0.04, 0.1))
-"""The same with larger last voxels: a few times faster, a little worse."""
+"""Levels with larger last voxels: a few times faster, a little worse."""
 CLOUD_STRIDE = 2
 ITERATIONS = 50
 MIN_POINTS = 100
 KISS_VOXEL_M = 0.05
-"""Of the keypoints for KISS-Matcher: at 0.08 and 0.1 m it is right less often on clouds of one room."""
+"""Voxel of the keypoints for KISS-Matcher: at 0.08 and 0.1 m it is right less often on clouds of one room."""
 EDGE_RATIO = 0.04
 """Pixels whose neighbour's depth differs by more than this share lie at an edge."""
 THREADS = 1
-"""Of Open3D and small_gicp: with two, poses differ in their last bits from call to call."""
+"""Threads of Open3D and small_gicp: with two, poses differ in their last bits from call to call."""
 
 
 def open3d() -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What GARPS loses or gains without one of its parts: the layout of the published ablation, with intervals."""
+"""Ablations of GARPS in the layout of the published one, with intervals."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ ROUNDING = 1e-9
 
 
 class Bar(NamedTuple):
-    """What is asked, the numbers, and whether it is met; None = its rows are missing."""
+    """A requirement, the numbers, and whether it is met; None = its rows are missing."""
 
     asked: str
     numbers: str
@@ -127,7 +127,7 @@ def _bare(lines: _Lines) -> Iterator[Bar]:
 
 
 def _far_apart(lines: _Lines) -> Bar:
-    """Of the small motions most are within 25 cm and 5 deg already, so that all peers succeed."""
+    """The bar on large motions; most small ones are within 25 cm and 5 deg already, so that all peers succeed."""
     return _advantage(lines, f"monocular, {BARE_ROOMS}, none, large motions:")
 
 
@@ -198,6 +198,6 @@ def print_bars(console: Console, found: Sequence[Bar]) -> None:
 
 
 def markdown_bars(found: Sequence[Bar]) -> str:
-    """The same for a document."""
+    """Markdown of the table that `print_bars` prints."""
     text = ["\n### Acceptance\n", "| asked | numbers | met |", "|---|---|---|"]
     return "\n".join([*text, *(f"| {bar.asked} | {bar.numbers} | {answer(bar)} |" for bar in found), ""])

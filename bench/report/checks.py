@@ -30,14 +30,14 @@ class Check:
         return self.value >= self.bar if self.at_least else self.value <= self.bar
 
     def cells(self) -> list[str]:
-        """What, measured, bar, met: as text."""
+        """Name, measured number, bar and verdict as text."""
         bar = "" if self.bar is None else f"{'>=' if self.at_least else '<='} {self.bar:g}"
         return [self.what, f"{self.value:.4g}", bar, {None: "", True: "yes", False: "NO"}[self.met]]
 
 
 @dataclass(frozen=True)
 class Section:
-    """What a section found: checks against bars, rows of a table, remarks, and whatever else is worth keeping."""
+    """Results of a section: checks against bars, rows of a table, notes, and raw numbers to keep."""
 
     title: str
     checks: list[Check]

@@ -43,7 +43,7 @@ TIME = (
     "one call from the images, without the depth that the pair has and without a start that is given; mean over the "
     "pairs, failures too"
 )
-"""What is inside the seconds of rows that `bench.rows.pair_rows` made."""
+"""Meaning of the seconds of rows that `bench.rows.pair_rows` made."""
 LENGTH_FROM_DEPTH = ("five-point", "colmap", "colmap-relaxed")
 """Methods that find a direction, and take the length of t from the depth of the pair (`bench.peers.metres`)."""
 COUNTS = ("n poses", "Failures")
@@ -138,7 +138,7 @@ def difference_table(rows: Sequence[Row], method: str = GARPS, error: str = "e_3
 
 
 def _differences(ours: Float64Array, theirs: Float64Array) -> list[str]:
-    """Of the pairs in which both errors are finite: their number, median and mean of the paired differences."""
+    """Number of pairs in which both errors are finite, median and mean of their paired differences."""
     both = np.isfinite(ours) & np.isfinite(theirs)
     if not both.any():
         return ["0", "-", "-"]
@@ -212,7 +212,7 @@ def _precision(rows: Sequence[Row], accepts: Callable[[Row], bool]) -> tuple[flo
 
 
 def note(rows: Iterable[Row]) -> str:
-    """What stands below a table: scale of the truth per set, number of pairs, borrowed lengths."""
+    """Notes below a table: scale of the truth per set, number of pairs, borrowed lengths."""
     rows = list(rows)
     sets = dict.fromkeys(row["set"] for row in rows)
     sources = {name: scale_sources(row for row in rows if row["set"] == name) for name in sets}
@@ -252,7 +252,7 @@ def _counts(rows: Sequence[Row]) -> list[str]:
 
 
 def _spread_columns(rows: Sequence[Row], middle: str, width: str) -> dict[str, list[str]]:
-    """Of every error "middle ± width", two fields of `Spread`; with n where it is not that of the poses."""
+    """Each error as "middle ± width", two fields of `Spread`, with n where it is not that of the poses."""
     columns = {}
     for error in ERRORS:
         digits, values, texts = _digits(error), [], []

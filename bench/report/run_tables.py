@@ -91,14 +91,14 @@ def print_tables(console: Console, rows: Sequence[Row], facts: Row) -> None:
 
 
 def caption(facts: Row) -> str:
-    """What the columns mean, and where rows were taken over from an earlier run."""
+    """The meaning of the columns, and a note of rows that were taken from an earlier run."""
     if not facts.get("reused_peers"):
         return CAPTION
     return f"{CAPTION} {facts['reused_peers']}"
 
 
 def markdown(rows: Sequence[Row], facts: Row) -> str:
-    """The same as `print_tables`, for a document."""
+    """Markdown of the tables that `print_tables` prints."""
     short = "; ".join(f"{name} {value}" for name, value in facts.items() if name not in ("settings", "reused_peers"))
     text = [f"{caption(facts)}\n", f"{short}\n"]
     headings = ["pairs", "method", *COLUMNS.values()]

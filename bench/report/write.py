@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run of `bench.run` leaves behind: rows, tables, plots, and pictures of pairs before and after."""
+"""The folder of a run of `bench.run`: rows, tables, plots, and pictures of pairs before and after."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What real depth sources do to a true depth map: a network's guess and a depth sensor's noise.
+"""Errors of real depth sources on a true depth map: a network's guess and a depth sensor's noise.
 
 Depth maps are HxW metres along z; NaN (or anything not finite and positive) is no reading and stays NaN.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where things stand: builds a furnished room from a seed. World frame: z up, floor at z = 0, metres."""
+"""A furnished room from a seed. World frame: z up, floor at z = 0, metres."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SKIN = 0.1  # thickness of walls, m
 
 @dataclass(eq=False)
 class _Plan:
-    """What is placed so far. Wall k has its own frame: x along it, y into it, z up, origin in its left corner."""
+    """Furniture placed up to now. Wall k has its own frame: x along it, y into it, z up, origin in its left corner."""
 
     size: Array
     parts: list[Part] = field(default_factory=list)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lights a room: a lamp under the ceiling and the windows, each as a few points of an area."""
+"""The lights of a room: a lamp under the ceiling and the windows, each as a few points of an area."""
 
 from __future__ import annotations
 

@@ -235,7 +235,7 @@ def keys_and_screen(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
 
 
 def outdoors(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
-    """What is behind the window pane: a landscape with panes drawn in front, bright. HxWx3."""
+    """View through a window: a landscape with panes drawn in front, bright. HxWx3."""
     image = landscape(rng, shape)
     return np.asarray(0.35 + 0.65 * image, np.float32)
 

@@ -20,7 +20,7 @@ DEFAULT_NOISE_SIGMA = 1.5  # grey levels of 255
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a camera sees.
+    """An image with depth and labels.
 
     Args:
         rgb: HxWx3 uint8.

@@ -37,11 +37,11 @@ class RoomPair:
     """Two views of a room and the truth between them.
 
     Args:
-        rgb0: HxWx3 uint8, likewise rgb1.
-        depth0: HxW float32 m with the requested noise, NaN = no reading; likewise depth1.
-        true_depth0: HxW float32 m, exact; likewise true_depth1.
-        labels0: HxW int32, index into `LABELS`; likewise labels1.
-        K0: 3x3 pixels; likewise K1. They differ by a few percent.
+        rgb0, rgb1: HxWx3 uint8.
+        depth0, depth1: HxW float32 m with the requested noise, NaN = no reading.
+        true_depth0, true_depth1: HxW float32 m, exact.
+        labels0, labels1: HxW int32, index into `LABELS`.
+        K0, K1: 3x3 pixels. They differ by a few percent.
         T_1_0: 4x4, points of camera 0 into camera 1, m.
         T_world_0: 4x4, points of camera 0 into the room, m.
         level: 1..5.

@@ -20,7 +20,7 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where N rays ended. `face` is -1 for a miss; t is then 0, u and v are meaningless."""
+    """First hits of N rays. `face` is -1 for a miss; t is then 0, u and v are meaningless."""
 
     face: npt.NDArray[np.int64]
     t: Float32Array

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How wrong depth maps are: AbsRel, delta < 1.25, and what of it two maps of a pair have in common."""
+"""Errors of depth maps against the truth: AbsRel, delta < 1.25, scale and shape."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from garps_core.types import View
 
 
 class DepthErrors(NamedTuple):
-    """Of one depth map against the truth; ratios are found / true."""
+    """Errors of one depth map against the truth; ratios are found / true."""
 
     abs_rel: float
     delta: float
@@ -41,7 +41,7 @@ def depth_errors(found: npt.NDArray[np.float32], true: npt.NDArray[np.float32]) 
 
 
 def errors_of_pair(found: Pair, true: Pair) -> list[DepthErrors] | None:
-    """Of the depth of source and target against that of another version of the same pair; None where it has none."""
+    """Errors of source and target depth against another version of the same pair; None where it has no depth."""
     views = ((found.source, true.source), (found.target, true.target))
     try:
         return [depth_errors(_depth(view), _depth(truth)) for view, truth in views]

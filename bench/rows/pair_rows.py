@@ -63,9 +63,9 @@ def rows_of_pair(
     prior, own = case.prior, None
     if GARPS in methods or prior is None:
         own = run_garps(config, pair, start, prior)
-    initial = prior if prior is not None or own is None else own[0].initial
-    rows = [_start_row(case, initial, None if prior is not None or own is None else own[0])]
-    T_start = None if initial is None else initial.T_target_source
+    start_pose = prior if prior is not None or own is None else own[0].initial
+    rows = [_start_row(case, start_pose, None if prior is not None or own is None else own[0])]
+    T_start = None if start_pose is None else start_pose.T_target_source
     for name in methods:
         if name == GARPS and own is not None:
             rows.append(_garps_row(case, GARPS, *own))
@@ -124,12 +124,12 @@ def run_garps(config: Config, pair: Pair, start: str, prior: Prior | None) -> tu
     return found, time.perf_counter() - began
 
 
-def _start_row(case: _Case, initial: Prior | None, own: PoseEstimate | None) -> Row:
+def _start_row(case: _Case, start_pose: Prior | None, own: PoseEstimate | None) -> Row:
     """The pose before the alignment; `own` = GARPS' estimate where it chose the pose itself."""
     seconds = float("nan") if own is None else own.seconds.get("initialise", float("nan"))
-    if initial is None:
+    if start_pose is None:
         return _row(case, START, None, seconds, "" if own is None else own.reason)
-    return _row(case, START, initial.T_target_source, seconds, "", initial.covariance)
+    return _row(case, START, start_pose.T_target_source, seconds, "", start_pose.covariance)
 
 
 def _garps_row(case: _Case, name: str, found: PoseEstimate, seconds: float) -> Row:

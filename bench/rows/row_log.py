@@ -19,7 +19,7 @@ Key = tuple[str, str, str, str]
 
 
 def key_of(row: Row) -> Key:
-    """Which pair of which table a row belongs to."""
+    """The table and pair that a row belongs to."""
     return row["depth"], row["set"], row["start"], row["pair"]
 
 
@@ -124,7 +124,7 @@ def _with_infinities(row: Row) -> Row:
 
 
 def reuse_note(rows: Sequence[Row], path: Path) -> str:
-    """How many rows of peers come from an earlier run, in words."""
+    """A sentence on the number of peers' rows that come from an earlier run."""
     peers = [row for row in rows if row["method"] in METHODS]
     commits = [row["reused"] for row in peers if "reused" in row]
     origin = f"{os.path.relpath(path)} (commit {', '.join(dict.fromkeys(commits)) or 'none'})"

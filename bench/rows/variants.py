@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GARPS as it is, with something left out, or with something put in: what each part is worth.
+"""GARPS as it is, with a part left out, or with a part added.
 
 The published ablations are `garps-labels` against `garps` (segmentation; only where the truth has labels: an oracle's),
 `garps-isotropic` and `garps-no-colour`.
@@ -26,12 +26,12 @@ from garps_core.start.initialise import initialise
 GARPS_NO_FEATURES = "garps-no-features"
 GARPS_PAPER = "garps-paper"
 VAGUE = 1e4
-"""Factor on the start's covariance that leaves it next to no say."""
+"""Factor on the start's covariance that leaves it next to no weight."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What is changed: settings, by name or from those there are; the mixtures; whether the start is believed, and is
+    """A change of GARPS: settings, by name or from those there are; the mixtures; whether the start is believed, and is
     that of GARPS as it is, although settings that it depends on are changed."""
 
     what: str
@@ -67,9 +67,10 @@ def last_rung(config: Config) -> Config:
 
 
 def as_published(config: Config) -> Config:
-    """The paper's own settings for lifting and alignment."""
-    paper = Config.preset("paper")
-    return replace(config, lifting=paper.lifting, alignment=paper.alignment)
+    """The paper's method with its own settings for lifting and alignment."""
+    published = Config.preset("paper")
+    parts = {name: getattr(published, name) for name in ("method", "lifting", "alignment", "paper")}
+    return replace(config, **parts)
 
 
 VARIANTS: dict[str, Variant] = {
@@ -80,7 +81,7 @@ VARIANTS: dict[str, Variant] = {
     "garps-no-colour": Variant(
         "neither colour nor brightness", {"alignment.colour_variance": 100.0, "alignment.brightness_measurements": 0.0}
     ),
-    "garps-no-brightness": Variant("not sharpened by brightness", {"alignment.brightness_measurements": 0.0}),
+    "garps-no-brightness": Variant("no brightness in the objective", {"alignment.brightness_measurements": 0.0}),
     "garps-equal-weights": Variant("every pixel counts the same, not the area it sees", {"lifting.weighting": "equal"}),
     "garps-no-visibility": Variant("neither visibility nor brightness", mixture=without_frustum),
     "garps-no-annealing": Variant("the finest rung only", settings=last_rung),

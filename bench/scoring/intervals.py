@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure a difference between two methods is, from the same pairs: the paired bootstrap."""
+"""Confidence intervals of differences between two methods on the same pairs: the paired bootstrap."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the errors of a method are summed up to: its own successes, all pairs, or the pairs that every method solved.
+"""Statistics of a method's errors: over its own successes, all pairs, or the pairs that every method solved.
 
 Rows are those of `bench.rows.pair_rows`, one per depth, set, start, pair and method. A mean or a spread exists over
 poses only, and flatters methods that fail on hard pairs; a median and an AUC exist over all pairs with failures at
@@ -28,7 +28,7 @@ PairKey = tuple[str, str, str, str]
 
 
 class Spread(NamedTuple):
-    """Of n values: mean and standard deviation (over n - 1), median and half the interquartile range, in their unit.
+    """Mean and standard deviation (over n - 1), median and half the interquartile range of n values, in their unit.
 
     Quartiles are interpolated linearly between values. NaN where there are too few.
     """
@@ -41,7 +41,7 @@ class Spread(NamedTuple):
 
 
 class AllPairs(NamedTuple):
-    """Of all n pairs: failures, medians of errors by name, AUC at 5, 10 and 20 deg, and mAA(30), shares 0..1."""
+    """Statistics of all n pairs: failures, medians by error, AUC at 5, 10 and 20 deg, and mAA(30), shares 0..1."""
 
     n: int
     failures: int
@@ -51,7 +51,7 @@ class AllPairs(NamedTuple):
 
 
 def pair_of(row: Row) -> PairKey:
-    """Which pair of which table a row is of."""
+    """The table and pair of a row."""
     return row.get("depth", ""), row["set"], row["start"], row["pair"]
 
 
@@ -66,12 +66,12 @@ def rows_of(rows: Iterable[Row], method: str) -> list[Row]:
 
 
 def scale_sources(rows: Iterable[Row]) -> list[str]:
-    """Where the lengths of the truth come from, as `Pair.scale` says, without the factors of single pairs."""
+    """Sources of the truth's lengths, from `Pair.scale`, without the factors of single pairs."""
     return list(dict.fromkeys(str(row.get("scale", "not stated")).partition(" x")[0] for row in rows))
 
 
 def length_unit(rows: Iterable[Row]) -> str:
-    """What lengths are in: m, or "raw" where a truth among them has the unit of its set."""
+    """The unit of lengths: m, or "raw" where a truth among them has the unit of its set."""
     return "raw" if "raw" in scale_sources(rows) else "m"
 
 
@@ -81,7 +81,7 @@ def errors_of(rows: Iterable[Row], name: str) -> Float64Array:
 
 
 def spread(values: npt.ArrayLike) -> Spread:
-    """Of the finite ones among the values."""
+    """Statistics of the finite values."""
     given = np.asarray(values, np.float64)
     kept = given[np.isfinite(given)]
     if not len(kept):

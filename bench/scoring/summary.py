@@ -15,7 +15,7 @@ from garps_core.checks import Float64Array
 
 SUCCESS_M, SUCCESS_DEG = 0.05, 2.0
 MAP_FREE_M, MAP_FREE_DEG = 0.25, 5.0
-"""What the Map-free relocalisation benchmark calls a usable pose."""
+"""Bounds of a usable pose in the Map-free relocalisation benchmark."""
 
 
 def is_right(row: Row, metres: float = SUCCESS_M, degrees: float = SUCCESS_DEG) -> bool:
@@ -38,7 +38,7 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
 
 
 def _table_of(row: Row) -> tuple[str, str, str]:
-    """What one table holds: the depth ("" where a row does not say), the set and the start."""
+    """Key of the table of a row: the depth ("" where a row does not name it), the set and the start."""
     return row.get("depth", ""), row["set"], row["start"]
 
 
@@ -87,7 +87,7 @@ def error_of(row: Row, name: str) -> float:
 
 
 def _defined(rows: Sequence[Row], name: str) -> Float64Array:
-    """Of the rows for which the truth defines the error; a NaN where it does for none."""
+    """Errors of the rows for which the truth defines one; a NaN where it does for none."""
     values = np.array([error_of(row, name) for row in rows])
     return values[~np.isnan(values)] if not np.isnan(values).all() else np.full(1, np.nan)
 
@@ -109,7 +109,7 @@ def roc_auc(scores: npt.ArrayLike, right: npt.ArrayLike) -> float:
 
 
 def quality_auc(rows: Sequence[Row]) -> tuple[float, str]:
-    """How well `quality` tells right poses from wrong ones over these rows, and the same for people.
+    """ROC AUC of `quality` as a classifier of right and wrong poses, and a text for people.
 
     A failure has quality 0. NaN, with the reason, where there is no quality or nothing to tell apart.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast, how large, how repeatable: ratios taken in one run on the same inputs, against the bars set for them.
+"""Speed, memory and repeatability: ratios taken in one run on the same inputs, against their bars.
 
     python -m bench.speed [--only pairs,paper,autograd,stream,growth,determinism,memory]
 
@@ -32,7 +32,7 @@ from bench.speed.stream import stream_section
 from garps_core import View
 
 PEER_THREADS = 2
-"""As many as GARPS may take; elsewhere peers get one, so that their poses are the same to the bit."""
+"""Threads of peers here, equal to those of GARPS; elsewhere peers get one, so that their poses repeat to the bit."""
 SECTIONS: dict[str, Callable[[Inputs], Section]] = {
     "pairs": pairs_section,
     "paper": paper_section,

@@ -81,7 +81,7 @@ def in_fresh_process(task: str, arrays: dict[str, Any], preset: str) -> dict[str
 
 
 def main(task: str, path: Path, preset: str) -> None:
-    """What the fresh process does: the task twice; prints its peak memory on the way and what it found, as JSON."""
+    """Do the task twice and print peak memory and the digest as JSON."""
     memory: dict[str, Any] = {"imports": peak_mib()}
     with np.load(path) as held:
         run = _estimation(held, preset) if task == "estimate" else _alignment(held, preset)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the cost grows with the number of components and of neighbours, all components used."""
+"""Growth of the cost with the number of components and of neighbours, all components used."""
 
 from __future__ import annotations
 

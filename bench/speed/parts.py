@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the sections of `bench.speed` share: their inputs, interleaved timing, one thread."""
+"""Inputs, interleaved timing and thread counts, shared by the sections of `bench.speed`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from garps_core import Config, Mixture, Prior, reconstruct
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What every section is given: settings, image pairs (the first is used where one will do), timed runs."""
+    """Inputs of every section: settings, image pairs (the first is used where one will do), timed runs."""
 
     preset: str
     pairs: tuple[Pair, ...]

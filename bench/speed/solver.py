@@ -36,7 +36,7 @@ SAME_STEPS = 100
 
 @dataclass(frozen=True)
 class Contest:
-    """The same components for both: only the weights are each preset's own (area seen; one per component)."""
+    """Both solvers with equal components: only the weights are each preset's own (area seen; one per component)."""
 
     mixtures: dict[str, tuple[Mixture, Mixture]]
     configs: dict[str, Config]
@@ -50,10 +50,10 @@ class Contest:
         return estimate
 
     def paper_pairs(self) -> Pairs:
-        """What the paper's solver works on. Raises RuntimeError when too little is left."""
+        """Pairs of the paper's solver. Raises RuntimeError when too few are left."""
         config = self.configs[PAPER]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[PAPER])
-        pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.alignment)
+        pairs = paper.paper_pairs(source, target, self.prior.T_target_source, config.paper)
         if pairs is None:
             raise RuntimeError("the paper's preset keeps fewer than 50 components of this pair: give a larger one")
         return pairs
@@ -70,12 +70,11 @@ class Contest:
 
     def published(self) -> Float64Array:
         """End pose of the paper's steps on the same, pairs chosen anew as above."""
-        settings = self.configs[PAPER].alignment
-        steps = settings.ladder[0].steps
-        return paper.adam_path(self.paper_pairs(), self.prior.T_target_source, settings, steps)[-1]
+        settings = self.configs[PAPER].paper
+        return paper.adam_path(self.paper_pairs(), self.prior.T_target_source, settings, settings.steps)[-1]
 
     def rung_pairs(self, rung: Rung, T: Float64Array) -> tuple[Pairs, Pairs]:
-        """What the default solver works on at pose T in one rung. Raises RuntimeError when too little is left."""
+        """Pairs of the default solver at pose T in one rung. Raises RuntimeError when too few are left."""
         config = self.configs[DEFAULT]
         source, target = (to_device(mixture, config) for mixture in self.mixtures[DEFAULT])
         with ThreadPoolExecutor(1) as pool:
@@ -90,7 +89,7 @@ def contest(inputs: Inputs, steps: int | None = None) -> Contest:
     """Both solvers on the first pair; `steps` of Adam instead of the published 1000 (for a quick test)."""
     published = Config.preset("paper")
     if steps is not None:
-        published = published.replace({"alignment.ladder": (replace(published.alignment.ladder[0], steps=steps),)})
+        published = published.replace({"paper.steps": steps})
     lifted = inputs.mixtures
     equal = tuple(replace(mixture, weights=np.ones_like(mixture.weights)) for mixture in lifted)
     mixtures = {DEFAULT: lifted, PAPER: (equal[0], equal[1])}
@@ -171,7 +170,7 @@ def _sizes(held: Contest, ends: dict[str, PoseEstimate]) -> list[str]:
 def autograd_section(inputs: Inputs, steps: int | None = None) -> Section:
     """The default solver against the plain script, which gets the number of threads that serves it best."""
     held = contest(inputs, steps)
-    wanted = held.configs[PAPER].alignment.ladder[0].steps
+    wanted = held.configs[PAPER].paper.steps
     objective = plain(held.paper_pairs())
     q, t = start_of(held.prior, objective.means.dtype)
 
@@ -196,7 +195,7 @@ def autograd_section(inputs: Inputs, steps: int | None = None) -> Section:
 
 
 def plain(pairs: Pairs) -> PlainObjective:
-    """The same candidate pairs, gathered one by one, for the reference."""
+    """Candidate pairs gathered one by one, for the reference."""
     k, n = pairs.log_weights.shape
     weights = (pairs.log_weights.exp() * pairs.weights).reshape(k * n)
     kept = weights > 0

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What demo_net is trained on."""
+"""Pictures with true depth that demo_net is trained on."""

@@ -30,17 +30,17 @@ from bench.rooms.textures import Texture
 
 FOLDER = Path("out/depth_data")
 FIRST_SEED = 100_000
-"""Of the rooms to learn from; benchmarks, tests and demos stay below."""
+"""Smallest seed of the rooms to learn from; benchmarks, tests and demos stay below."""
 HEIGHT, WIDTH = 192, 256
 VIEWS = 12
-"""Of a room: most of the time goes into making it."""
+"""Pictures of a room: most of the time goes into making it."""
 FOCAL = (0.5, 1.1)
 """Focal length over the picture's width, 90 to 49 degrees; crops in training narrow it further."""
 TRIED = 3
 """Cameras per picture, of which the one that sees farthest is kept: else half of all pictures were a piece of wall."""
 CLEARANCE_M = 0.2
 DARK_SHARE = 0.2
-"""Of the pictures, taken in the dark by a moving camera (`bench.rooms.dark`)."""
+"""Share of the pictures that are taken in the dark by a moving camera (`bench.rooms.dark`)."""
 VERSION = 1
 
 
@@ -93,7 +93,7 @@ def _tinted(texture: Texture, rng: np.random.Generator) -> Texture:
 
 
 def intrinsics(rng: np.random.Generator) -> Array:
-    """Of a camera of `WIDTH` x `HEIGHT` pixels whose principal point is nearly in the middle."""
+    """K, 3x3 px, of a camera of `WIDTH` x `HEIGHT` pixels whose principal point is nearly in the middle."""
     f = WIDTH * float(np.exp(rng.uniform(*np.log(FOCAL))))
     cx, cy = (side * (0.5 + rng.normal(0, 0.01)) - 0.5 for side in (WIDTH, HEIGHT))
     return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
@@ -115,7 +115,7 @@ def free_camera(room: Room, rng: np.random.Generator) -> Array:
 
 
 def median_depth_m(room: Room, T: Array, K: Array) -> float:
-    """Of a coarse picture from there."""
+    """Median depth of a coarse picture from there, m."""
     scale = np.diag([1 / 16, 1 / 16, 1.0])
     rays = camera_rays(scale @ K, WIDTH // 16, HEIGHT // 16).reshape(-1, 3)
     return float(np.median(room.cast(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32)).t))

@@ -22,7 +22,7 @@ from garps_core.cli.weights import app as weights_app
 from garps_core.config import PRESETS, Config, Reconstruction, methods
 from garps_core.config.combinations import check_settings
 from garps_core.config.start import STARTS, TWO_VIEW
-from garps_core.config.text import changed_config, read_settings
+from garps_core.config.text import configured
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.mixtures.splat_reader import read_splats
@@ -134,13 +134,10 @@ def align(
     """
     files, depths, Ks = (source, target), (depth_source, depth_target), (K, K_target)
     splats, given = _are_splats(files, reconstruction), _prior(prior, prior_sigma)
-    options = {"device": device, "reconstruction.method": reconstruction, "start.method": start}
-    if preset is None:
-        method = _configured(Config(), None, settings, set_, options).reconstruction.method
-        base = Config.preset(preset_for(method, splats or any(depths)))
-    else:
-        base = Config.preset(preset)
-    config = _configured(base, preset, settings, set_, options)
+    changes = _changes(set_, {"device": device, "reconstruction.method": reconstruction, "start.method": start})
+    with_depth = splats or any(depths)
+    config = configured(preset, settings, changes, lambda asked: preset_for(asked.reconstruction.method, with_depth))
+    checked_device(config.device)
     if splats:
         estimate, mixtures = _of_splats(files, config, given, any(depths + Ks))
     else:
@@ -240,13 +237,9 @@ def _uncalibrated(
     return source, target, maps
 
 
-def _configured(
-    base: Config, preset: str | None, file: Path | None, changes: list[str] | None, options: dict[str, str | None]
-) -> Config:
-    given = {name: value for name, value in options.items() if value is not None}
-    config = changed_config(base if file is None else read_settings(file, base, preset), changes or []).replace(given)
-    checked_device(config.device)
-    return config
+def _changes(given: list[str] | None, options: dict[str, str | None]) -> list[str]:
+    """Return NAME=VALUE of --set, then of options that stand for a setting."""
+    return [*(given or []), *(f"{name}={value}" for name, value in options.items() if value is not None)]
 
 
 def _intrinsics(option: str, values: Four) -> Float64Array:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings: every one has a default, a range, a unit and a meaning. `config.py` holds `Config` and the presets."""
+"""Settings with default, range, unit and meaning. `config.py` holds `Config` and the presets."""
 
 from garps_core.config.alignment import Alignment
 from garps_core.config.config import PRESETS, Config
 from garps_core.config.ladders import Rung
 from garps_core.config.lifting import Lifting
+from garps_core.config.paper import Paper
 from garps_core.config.reconstruction import SCENES, Reconstruction, depth_networks, methods
 from garps_core.config.start import STARTS, TWO_VIEW, Start
 
@@ -16,6 +17,7 @@ __all__ = [
     "Alignment",
     "Config",
     "Lifting",
+    "Paper",
     "Reconstruction",
     "Rung",
     "Start",

@@ -14,12 +14,6 @@ from garps_core.errors import ConfigError
 class Alignment(Checked):
     """The objective, how `align_mixtures` maximises it, and what a pose must fulfil to be `converged`."""
 
-    solver: str = setting(
-        "second_order",
-        "method of maximisation: second_order = annealed maximum a posteriori, adam = that of the paper",
-        choices=("second_order", "adam"),
-        expert=True,
-    )
     ladder: tuple[Rung, ...] = SENSOR
     """Rungs from the start pose."""
     search: tuple[Rung, ...] = SEARCH
@@ -47,13 +41,6 @@ class Alignment(Checked):
         "density of outliers, as a share of the density that one perfect partner gives",
         low=0,
         high=10,
-        expert=True,
-    )
-    depth_weight: float = setting(
-        1.0,
-        "factor on log depth when partners are the nearest in the image; 1 = they are the nearest in space",
-        low=1e-3,
-        high=1,
         expert=True,
     )
     max_distance_m: float = setting(
@@ -145,18 +132,6 @@ class Alignment(Checked):
         low=1e-6,
         high=1e6,
         expert=True,
-    )
-    component_stride: int = setting(
-        1, "every n-th component is used by the paper's method, 1 = all", low=1, high=100_000, expert=True
-    )
-    opacity_threshold: float = setting(
-        0.0, "smallest weight of a component that the paper's method uses, 0 = all", low=0, high=1, expert=True
-    )
-    adam_rate_translation: float = setting(
-        9e-5, "learning rate of Adam for the translation", unit="m", low=0, high=1, expert=True
-    )
-    adam_rate_rotation: float = setting(
-        3e-6, "learning rate of Adam for the rotation, a unit quaternion", low=0, high=1, expert=True
     )
 
     def __post_init__(self) -> None:

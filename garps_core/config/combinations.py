@@ -1,42 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings that do not go together, each with what to change."""
+"""Settings that do not go together, each with the change that helps."""
 
 from __future__ import annotations
 
 from garps_core.config.config import Config
 from garps_core.config.start import TWO_VIEW, Start
-from garps_core.errors import (
-    ConfigError,
-    MissingDepthError,
-)
+from garps_core.errors import ConfigError, MissingDepthError
 
 
 def check_settings(config: Config) -> None:
-    """Raises ConfigError where depth from a network meets settings for a sensor's; for auto it is a view's fault."""
+    """Check settings for views whose depth a network gives.
+
+    Raises:
+        ConfigError: settings that do not go together, or that are for the depth of a sensor.
+        MissingDepthError: `reconstruction.method` is auto and the settings are for a sensor: the view lacks depth.
+    """
     check_start(config.start)
-    if config.reconstruction.method == "two_view" and config.start.method not in TWO_VIEW:
+    _check_two_view(config)
+    if config.alignment.depth_errors or config.method == "paper":
+        return
+    if config.reconstruction.method == "auto":
+        raise MissingDepthError(
+            "the view has no depth: expected HxW float32 metres. Give View(..., depth=...), or take the preset "
+            "monocular, whose depth comes from a network"
+        )
+    raise ConfigError(
+        f"reconstruction.method is {config.reconstruction.method}, whose depth is off by per cents as a whole, and "
+        "alignment.depth_errors is false: expected the preset monocular. With settings for a sensor the covariance "
+        "would be too small"
+    )
+
+
+def _check_two_view(config: Config) -> None:
+    """Raise ConfigError where both views' depth shall come from a two-view network that cannot give it."""
+    if config.reconstruction.method != "two_view":
+        return
+    if config.start.method not in TWO_VIEW:
         raise ConfigError(
             f"reconstruction.method is two_view and start.method is {config.start.method}: expected a two-view network "
             f"to start with, one of {', '.join(TWO_VIEW)}"
         )
-    if config.reconstruction.method == "two_view" and config.start.method == "dust3r":
+    if config.start.method == "dust3r":
         raise ConfigError("reconstruction.method is two_view and the points of dust3r have no metres: expected mast3r")
-    if config.alignment.depth_errors or config.alignment.solver == "adam":
-        return
-    if config.reconstruction.method == "auto":
-        raise MissingDepthError(
-            "the view has no depth: expected HxW float32 metres; give View(..., depth=...), or take the preset "
-            "monocular, which asks a network"
-        )
-    raise ConfigError(
-        f"reconstruction.method is {config.reconstruction.method}, whose depth is off by per cents as a whole, and "
-        "alignment.depth_errors is false, as for a sensor, so the covariance would promise too much: expected the "
-        "preset monocular"
-    )
 
 
 def check_start(start: Start) -> None:
-    """Raises ConfigError for a two-view network that cannot do what the other settings of the start ask for."""
+    """Raise ConfigError for a two-view network that cannot do what other settings of the start ask for."""
     if start.method == "dust3r" and start.scale == "network":
         raise ConfigError("start.scale is network, and dust3r has no metres: expected auto or depth")
     if start.method == "dust3r" and start.pose_from == "matches":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a setting is: a field that knows its meaning, unit and range, and a dataclass that checks its own fields."""
+"""A setting is a field that knows its meaning, unit and range; a class of settings checks its own fields."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ _KINDS = {bool: "True or False", str: "text", tuple: "a tuple"}
 
 
 class Checked:
-    """Base of a settings dataclass: checks every field against its own description, raises ConfigError.
+    """Base of a dataclass of settings, which checks every field against its description and raises ConfigError.
 
-    Errors name a field with `prefix` before it: by default the class in lower case and a dot.
+    Errors name a field with `prefix` before it, by default the name of the class in lower case and a dot.
     """
 
     _prefix: ClassVar[str]
@@ -91,7 +91,7 @@ def _check_number(name: str, value: Any, default: float, limits: Mapping[str, An
 
 
 def flattened(prefix: str, part: Any) -> list[tuple[str, Any]]:
-    """Every setting of a dataclass of settings, and of those inside it, by dotted name, in order of definition."""
+    """Return every setting of a dataclass, and of those inside it, by dotted name in order of definition."""
     rows: list[tuple[str, Any]] = []
     for f in dataclasses.fields(part):
         value = getattr(part, f.name)
@@ -101,12 +101,23 @@ def flattened(prefix: str, part: Any) -> list[tuple[str, Any]]:
 
 
 def replaced(part: Any, name: str, path: list[str], value: Any, whole: Any = None) -> Any:
-    """A copy of `part` with the setting at `path` changed. Raises ConfigError, with a hint, where there is none."""
+    """Return a copy of `part` with the setting at `path` changed.
+
+    Args:
+        part: dataclass of settings.
+        name: dotted name as the user gave it, for errors.
+        path: names from `part` down to the setting.
+        value: its new value.
+        whole: settings among which the nearest name is looked for; `part` when None.
+
+    Raises:
+        ConfigError: no such setting, with the nearest name; or a value that is not allowed.
+    """
     whole = part if whole is None else whole
     names = [f.name for f in dataclasses.fields(part)] if dataclasses.is_dataclass(part) else []
     if path[0] not in names:
         near = difflib.get_close_matches(name, [known for known, _ in flattened("", whole)], n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else "docs/parameters.md lists all names"
+        hint = f"did you mean {near[0]!r}?" if near else "expected a name of docs/parameters.md"
         raise ConfigError(f"setting {name!r} does not exist; {hint}")
     if len(path) > 1:
         value = replaced(getattr(part, path[0]), name, path[1:], value, whole)

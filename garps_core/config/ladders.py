@@ -97,6 +97,4 @@ ladder therefore begins at 100 and ends at 4, where narrower kernels would follo
 NETWORK_SEARCH = (*_FROM_A_GUESS, *NETWORK[1:])
 """Ladder from a pose that a search has found, for depth of a network."""
 
-PAPER = (Rung(covariance_scale=90.0, components=1_000_000, neighbours=30, steps=1000),)
-"""Rung of the published method: no annealing, all components, 1000 steps of Adam."""
 # fmt: on

@@ -68,7 +68,7 @@ class Reconstruction(Checked):
     )
     scene: str = setting(
         "any",
-        "kind of scene that the weights of the depth network are made for; it also says so for a file that does not",
+        "kind of scene that the depth network's weights must be made for; a file that names none counts as this",
         choices=SCENES,
         live=False,
     )

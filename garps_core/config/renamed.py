@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings that had another name, or words of theirs that did, in the release before: they work on, with a warning."""
+"""Old names of settings, and old words for their values; they work for one release, with a warning."""
 
 from __future__ import annotations
 
@@ -24,12 +24,17 @@ class Renamed:
 RENAMED = (
     Renamed("alignment.information", "alignment.effective_measurements"),
     Renamed("alignment.brightness", "alignment.brightness_measurements"),
+    Renamed("alignment.solver", "method", {"adam": "paper", "second_order": "garps"}),
+    Renamed("alignment.component_stride", "paper.component_stride"),
+    Renamed("alignment.opacity_threshold", "paper.opacity_threshold"),
+    Renamed("alignment.adam_rate_translation", "paper.rate_translation"),
+    Renamed("alignment.adam_rate_rotation", "paper.rate_rotation"),
 )
-"""One line for each, kept for one release."""
+"""Table of old names, one line each; a line is deleted after one release."""
 
 
 def current(name: str, value: Any) -> tuple[str, Any]:
-    """Return name and value as they are called now; the first use of an old name is a warning in the log."""
+    """Return name and value as they are called now. The first use of an old name is a warning in the log."""
     for renamed in RENAMED:
         if renamed.old == name:
             new = renamed.values.get(value, value) if isinstance(value, str) else value

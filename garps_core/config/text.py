@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,28 @@ def _value(name: str, text: str, current: Any) -> Any:
             kind = "an integer" if isinstance(current, int) else "a number"
             raise ConfigError(f"{name} is {text!r}: expected {kind}") from None
     return text
+
+
+def configured(
+    preset: str | None, file: Path | None, changes: Iterable[str], default: Callable[[Config], str]
+) -> Config:
+    """Return the settings that a command line asks for: preset, then file, then single changes above these.
+
+    Args:
+        preset: name of the preset; None = the one that the file names, else `default`.
+        file: settings file, see `read_settings`; None = none.
+        changes: single settings, NAME=VALUE.
+        default: gives the name of the preset that goes with the settings as they are without one.
+
+    Raises:
+        ConfigError: no such preset, file or setting, or a value out of range.
+    """
+    changes = list(changes)
+
+    def changed(base: Config) -> Config:
+        return changed_config(base if file is None else read_settings(file, base, preset), changes)
+
+    return changed(Config.preset(preset or default(changed(Config()))))
 
 
 def read_settings(path: Path, config: Config | None = None, preset: str | None = None) -> Config:

@@ -126,8 +126,7 @@ def mixture_of(view: View, config: Config, networks: Networks | None = None) -> 
     if mixture is not None:
         return mixture if labels is None else labelled(mixture, labels, view.K)
     gaussians = predict_gaussians(networks.flash3d(config), view, settings.drop_border, dtype_of(config))
-    published = config.alignment.solver == "adam"
-    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not published)
+    return gaussians_to_mixture(gaussians, view, config.lifting, labels, along_curve=not config.published_order)
 
 
 def mixtures_of(views: Sequence[View], config: Config, networks: Networks | None = None) -> list[Mixture]:

@@ -59,11 +59,8 @@ class Backend(Protocol):
     ) -> tuple[float, float, Array, Array]:
         """Value and support of the "log" objective at the 4x4 pose T that moves the rows, and both `moments`."""
 
-    def nearest(self, moved: Tensor, partners: Tensor, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
-        """Indices and distances (n, k) of the nearest partners (m, 3) of the moved rows (n, 3), by distance.
-
-        Distances are in metres, or in `image_coordinates` with depth_weight below 1.
-        """
+    def nearest(self, moved: Tensor, partners: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """Indices and distances (n, k) of the k nearest partners (m, 3) of the moved rows (n, 3), nearest first, m."""
 
     def gathered(
         self,

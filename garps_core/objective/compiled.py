@@ -46,13 +46,13 @@ def log_objective(
     return loops.evaluated(mu, S, R, t, turn, w, *partners)
 
 
-def nearest(moved: Tensor, partners: Tensor, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
-    """Search cells of the partners' image; where these do not pay, or cannot be made, the tree."""
+def nearest(moved: Tensor, partners: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Search the cells of the partners' image; or the tree, where cells do not pay or a partner is not in the image."""
     many = len(moved) > neighbours.MOST_ROWS
-    if many or not len(partners) or float(partners[:, 2].min()) <= plain.NEAREST_Z_M:
-        return plain.nearest(moved, partners, k, depth_weight)
+    if many or not len(partners) or float(partners[:, 2].min()) <= neighbours.NEAREST_M:
+        return plain.nearest(moved, partners, k)
     rows, points = _arrays(moved, partners)
-    index, distance = neighbours.nearest(rows, points, k, depth_weight)
+    index, distance = neighbours.nearest(rows, points, k)
     return torch.from_numpy(index), torch.from_numpy(distance)
 
 

@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from garps_core.objective.loops import Float32, Int64, loop
 
+NEAREST_M = 1e-3
+"""Points nearer than this, or behind the camera, have no place in its image, m."""
 PER_CELL = 2.0
 """Partners in a cell, on average."""
 MOST_ROWS = 40_000
@@ -21,15 +23,14 @@ are the more, the denser the partners."""
 
 
 @loop
-def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tuple[Int64, Float32]:
+def nearest(rows: Float32, partners: Float32, k: int) -> tuple[Int64, Float32]:
     """The k nearest partners of each row, exact: indices (n, k) by distance, and distances (n, k).
 
-    rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Distances in metres, or in
-    `plain.image_coordinates` with depth_weight < 1. Partners are sorted into cells of the image; rings of cells
-    around a row's pixel are searched until no unseen cell can hold a nearer one: whatever lies beyond a line x = a z
-    of the image is at least |x - a z| / sqrt(1 + a^2) away.
+    rows (n, 3), partners (m, 3), in the same frame, partners in front of the camera. Partners are sorted into
+    cells of the image; rings of cells around a row's pixel are searched until no cell beyond them can hold a nearer
+    one: whatever lies beyond a line x = a z of the image is at least |x - a z| / sqrt(1 + a^2) away.
     """
-    n, m, in_image = len(rows), len(partners), depth_weight < 1
+    n, m = len(rows), len(partners)
     slopes = np.empty((m, 2), np.float32)
     for i in range(m):
         for axis in range(2):
@@ -43,21 +44,14 @@ def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tu
     points = np.empty((m, 3), np.float32)
     for i in range(m):
         p = partners[order[i]]
-        if in_image:
-            points[i, 0], points[i, 1] = p[0] / p[2], p[1] / p[2]
-            points[i, 2] = depth_weight * np.log(p[2])
-        else:
-            points[i, 0], points[i, 1], points[i, 2] = p[0], p[1], p[2]
+        points[i, 0], points[i, 1], points[i, 2] = p[0], p[1], p[2]
     grid = (low_x, low_y, cell, across, down)
     index, distance = np.empty((n, k), np.int64), np.empty((n, k), np.float32)
     best, where = np.empty(k, np.float32), np.empty(k, np.int64)
     for i in range(n):
         x, y, z = rows[i, 0], rows[i, 1], rows[i, 2]
-        safe = max(z, np.float32(1e-3))
-        q0, q1, q2 = x, y, z
-        if in_image:
-            q0, q1, q2 = x / safe, y / safe, np.float32(depth_weight * np.log(safe))
-        _search_rings(q0, q1, q2, x / safe, y / safe, z, points, first, grid, in_image, best, where)
+        safe = max(z, np.float32(NEAREST_M))
+        _search_rings(x, y, z, x / safe, y / safe, points, first, grid, best, where)
         for j in range(k):
             index[i, j], distance[i, j] = order[where[j]], np.sqrt(best[j])
     return index, distance
@@ -65,10 +59,10 @@ def nearest(rows: Float32, partners: Float32, k: int, depth_weight: float) -> tu
 
 @loop
 def _search_rings(
-    q0: float, q1: float, q2: float, slope_x: float, slope_y: float, z: float, points: Float32, first: Int64,
-    grid: tuple[float, float, float, int, int], in_image: bool, best: Float32, where: Int64,
+    x: float, y: float, z: float, slope_x: float, slope_y: float, points: Float32, first: Int64,
+    grid: tuple[float, float, float, int, int], best: Float32, where: Int64,
 ) -> None:  # fmt: skip
-    """Fill `best` (squared distances, sorted) and `where` with the nearest points of (q0, q1, q2)."""
+    """Fill `best` (squared distances, sorted) and `where` with the nearest points of (x, y, z)."""
     low_x, low_y, cell, across, down = grid
     column = min(max(int((slope_x - low_x) / cell), 0), across - 1)
     row = min(max(int((slope_y - low_y) / cell), 0), down - 1)
@@ -80,20 +74,20 @@ def _search_rings(
             step = 1 if abs(v - row) == ring else max(2 * ring, 1)
             for u in range(column - ring, column + ring + 1, step):
                 if u >= 0 and u < across:
-                    _keep_nearest(q0, q1, q2, points, first[v * across + u], first[v * across + u + 1], best, where)
+                    _keep_nearest(x, y, z, points, first[v * across + u], first[v * across + u + 1], best, where)
         bound = np.inf
         if column - ring > 0:
             line = low_x + (column - ring) * cell
-            bound = min(bound, _beyond(slope_x - line, line, z, in_image))
+            bound = min(bound, _beyond(slope_x - line, line, z))
         if column + ring + 1 < across:
             line = low_x + (column + ring + 1) * cell
-            bound = min(bound, _beyond(line - slope_x, line, z, in_image))
+            bound = min(bound, _beyond(line - slope_x, line, z))
         if row - ring > 0:
             line = low_y + (row - ring) * cell
-            bound = min(bound, _beyond(slope_y - line, line, z, in_image))
+            bound = min(bound, _beyond(slope_y - line, line, z))
         if row + ring + 1 < down:
             line = low_y + (row + ring + 1) * cell
-            bound = min(bound, _beyond(line - slope_y, line, z, in_image))
+            bound = min(bound, _beyond(line - slope_y, line, z))
         if bound == np.inf or bound * bound > best[-1]:
             return
         ring += 1
@@ -101,12 +95,12 @@ def _search_rings(
 
 @loop
 def _keep_nearest(
-    q0: float, q1: float, q2: float, points: Float32, begin: int, end: int, best: Float32, where: Int64
+    x: float, y: float, z: float, points: Float32, begin: int, end: int, best: Float32, where: Int64
 ) -> None:
     """Insert the points of one cell that are nearer than the farthest kept so far."""
     last = len(best) - 1
     for p in range(begin, end):
-        d0, d1, d2 = points[p, 0] - q0, points[p, 1] - q1, points[p, 2] - q2
+        d0, d1, d2 = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
         d = d0 * d0 + d1 * d1 + d2 * d2
         if d < best[last]:
             place = last
@@ -117,11 +111,11 @@ def _keep_nearest(
 
 
 @loop
-def _beyond(gap: float, line: float, z: float, in_image: bool) -> float:
+def _beyond(gap: float, line: float, z: float) -> float:
     """Distance from a row to all that lies beyond a line of the image, `gap` slopes away; 0 when nothing is known."""
-    if gap <= 0 or z <= 1e-3:
+    if gap <= 0 or z <= NEAREST_M:
         return 0.0
-    return gap if in_image else gap * z / np.sqrt(1 + line * line)
+    return float(gap * z / np.sqrt(1 + line * line))
 
 
 @loop
@@ -178,7 +172,7 @@ def visible(points: Float32, R: Float32, t: Float32, K: Float32, depth: Float32,
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         forward = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-        if forward > np.float32(1e-3):
+        if forward > np.float32(NEAREST_M):
             u = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / forward * K[0, 0] + K[0, 2]
             v = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / forward * K[1, 1] + K[1, 2]
             if u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5:

@@ -86,7 +86,7 @@ def overlap(source: DeviceMixture, target: DeviceMixture, T: Array, settings: Al
 
 def pair_up(rows: DeviceMixture, partners: DeviceMixture, T: Array, rung: Rung, settings: Alignment) -> Pairs:
     """Candidate pairs of `rows` (moved by T) with their nearest `partners`, covariances widened by the rung."""
-    index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)), settings.depth_weight)
+    index, distance = _nearest(rows, partners, T, min(rung.neighbours, len(partners)))
     means, covariances, log_weights = _gathered(rows, partners, index, rung, settings)
     if rows.labels is not None and partners.labels is not None:
         differs = (rows.labels[None] != partners.labels[index.T]).to(log_weights.dtype)
@@ -125,13 +125,11 @@ def _gathered(
     return rows.backend.gathered(index, means, covariances, log_weights, colours, rows.colours, per_colour)
 
 
-def _nearest(
-    rows: DeviceMixture, partners: DeviceMixture, T: Array, k: int, depth_weight: float
-) -> tuple[Tensor, Tensor]:
-    """Indices and distances (n, k) of the nearest partners; metres, or image coordinates if depth_weight < 1."""
+def _nearest(rows: DeviceMixture, partners: DeviceMixture, T: Array, k: int) -> tuple[Tensor, Tensor]:
+    """Indices and distances (n, k) of the nearest partners of the rows moved by T, m."""
     like = rows.means
     R, t = (torch.as_tensor(part, dtype=like.dtype, device=like.device) for part in (T[:3, :3], T[:3, 3]))
-    return rows.backend.nearest(like @ R.T + t, partners.means, k, depth_weight)
+    return rows.backend.nearest(like @ R.T + t, partners.means, k)
 
 
 def _log_floor(covariances: Tensor, partners: DeviceMixture, floor: float) -> Tensor:

@@ -17,8 +17,6 @@ CHUNK_PAIRS_CUDA = 1 << 22
 """Pairs handled at a time on a GPU, where a chunk must be large enough to fill it."""
 NOTHING = -60.0
 """Smallest logarithm of a density relative to the floor; smaller densities would become slow subnormals."""
-NEAREST_Z_M = 1e-3
-"""Image coordinates of points nearer than this, or behind the camera, are taken at this range."""
 
 
 def row_sums(
@@ -96,24 +94,15 @@ def log_objective(
     return value, float((c * s).sum()), summed, turning
 
 
-def nearest(moved: Tensor, partners: Tensor, k: int, depth_weight: float) -> tuple[Tensor, Tensor]:
+def nearest(moved: Tensor, partners: Tensor, k: int) -> tuple[Tensor, Tensor]:
     """Search a k-d tree, or on a GPU the whole table of distances."""
-    like, n = moved, len(moved)
-    if depth_weight < 1:
-        moved, partners = image_coordinates(moved, depth_weight), image_coordinates(partners, depth_weight)
-    if like.is_cuda:
+    if moved.is_cuda:
         found = [torch.cdist(block, partners).topk(k, largest=False) for block in torch.split(moved, 4096)]
         return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
     tree = cKDTree(partners.numpy(), balanced_tree=False, compact_nodes=False, leafsize=32)
     distance, index = tree.query(moved.numpy(), k=k, workers=-1)
-    shape = (n, k)
-    return torch.from_numpy(index.reshape(shape)), torch.from_numpy(distance.reshape(shape)).to(like.dtype)
-
-
-def image_coordinates(points: Tensor, depth_weight: float) -> Tensor:
-    """(n, 3) m -> (x/z, y/z, depth_weight log z): a partner along the same ray is near although its depth is off."""
-    z = points[:, 2:].clamp_min(NEAREST_Z_M)
-    return torch.cat([points[:, :2] / z, depth_weight * torch.log(z)], dim=1)
+    shape = (len(moved), k)
+    return torch.from_numpy(index.reshape(shape)), torch.from_numpy(distance.reshape(shape)).to(moved.dtype)
 
 
 def gathered(

@@ -67,17 +67,12 @@ class Solution:
     pairs: tuple[Pairs, Pairs] | None = None
     """Pairs on which `data` was evaluated: source rows to target partners, and target rows to source partners."""
     fixed_steps: bool = False
-    """The paper's sum was maximised for a fixed number of steps: there is no test of convergence, and no support."""
+    """The method takes a fixed number of steps and has no test of convergence."""
 
     @property
     def T(self) -> Array:
         """4x4 pose."""
         return self.at.T
-
-    @property
-    def support(self) -> float | None:
-        """Share of the components with a partner; None where the objective has none."""
-        return None if self.fixed_steps else self.data.support
 
 
 def two_way(forward: Pairs, backward: Pairs, at: State, pool: Executor) -> Evaluation:
@@ -266,10 +261,15 @@ def pairs_at(problem: Problem, at: State, rung: Rung, density: float) -> tuple[P
 
 def with_final_pairs(solution: Solution, problem: Problem) -> Solution:
     """The solution with the data term of the last rung evaluated anew at its pose, with many partners per row."""
-    settings = problem.settings
-    rung = replace(settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
-    pairs = pairs_at(problem, solution.at, rung, FINAL_DENSITY)
+    pairs = final_pairs(solution.at, problem)
     if pairs is None:
         return solution
     data = two_way(*pairs, relative_to(solution.at, solution.at), problem.pool)
-    return replace(solution, pairs=pairs, data=data, weight=settings.effective_measurements * data_weight(rung))
+    weight = problem.settings.effective_measurements * data_weight(problem.settings.ladder[-1])
+    return replace(solution, pairs=pairs, data=data, weight=weight)
+
+
+def final_pairs(at: State, problem: Problem) -> tuple[Pairs, Pairs] | None:
+    """Pairs of the last rung at a state, with many partners per row; None when too few components are seen."""
+    rung = replace(problem.settings.ladder[-1], components=FINAL_ROWS, neighbours=FINAL_NEIGHBOURS)
+    return pairs_at(problem, at, rung, FINAL_DENSITY)

@@ -28,7 +28,7 @@ class Problem:
     config: Config
     pool: Executor
     guess: bool = False
-    """The start says next to nothing, so a solver may search around it."""
+    """The start is a guess that carries next to no information, so a solver may search around it."""
 
     @property
     def settings(self) -> Alignment:

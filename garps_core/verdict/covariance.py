@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances: from curvature and shared depth errors to an honest 6x6, and between conventions.
+"""The 6x6 covariance of a pose, from the curvature of the posterior and the errors that a depth map shares.
 
 A left twist (v, w) perturbs T to exp(v, w) T: the position t becomes t + v + w x t. ROS (REP 103) wants the
 covariance of the position itself and of small rotations about the fixed axes: (dt, w) with dt = v - [t]x w.
@@ -18,27 +18,28 @@ from garps_core.objective.with_depth_errors import backward_jacobian
 from garps_core.solver.ladder import Solution, curvature
 
 OPEN_BELOW = 0.02
-"""A textureless wall keeps 0.5 to 1.5 % of its curvature, from the rim of the overlap alone: so little is none."""
+"""Share of the Gauss-Newton curvature below which a direction is open. A textureless wall keeps 0.5 to 1.5 %, from the
+rim of the overlap alone."""
 OPEN_DIRECTION = 1e-5
-"""Share of the curvature that open directions are given: a very large variance."""
+"""Share of the Gauss-Newton curvature that an open direction gets, so that its variance is very large."""
 
 
-def pose_covariance(solution: Solution, known: WeightedStart, lifting: Lifting) -> Array:
-    """6x6 covariance (ROS meaning) at the solution.
+def pose_covariance(solution: Solution, start: WeightedStart, lifting: Lifting) -> Array:
+    """6x6 covariance (ROS order and meaning) at the solution.
 
-    The pose's part of the inverse of (weighted observed information of the data + precision of what was known), plus
-    what one sigma of every shared error that was not solved for does to the optimum.
+    It is the pose block of the inverse of (weighted observed information of the data + precision of the start), plus
+    the covariance of the shifts that the shared depth errors cause in the optimum, unless they were solved for.
 
     Args:
-        solution: pose, and pairs chosen anew at it with many partners each (few, frozen partners look like curvature).
-        known: the prior of pose and depth errors.
+        solution: pose with its final pairs; few, frozen partners would look like curvature.
+        start: prior of pose and depth errors.
         lifting: sigmas of the shared errors.
     """
-    data, weight, precision = solution.data, solution.weight, known.joint()
+    data, weight, precision = solution.data, solution.weight, start.joint()
     covariance = np.linalg.inv(weight * curvature(data, OPEN_DIRECTION, OPEN_BELOW) + precision)
     if solution.pairs is not None:
         sigmas = error_sigmas(lifting)
-        if len(known.error_precision):
+        if len(start.error_precision):
             sigmas[:DEPTH_MODES] = 0.0
         held = np.linalg.inv(weight * data.information + precision)
         for pull in error_gradients(*solution.pairs, solution.at):
@@ -48,36 +49,37 @@ def pose_covariance(solution: Solution, known: WeightedStart, lifting: Lifting) 
     return ros_from_twist(0.5 * (of_pose + of_pose.T), solution.T)
 
 
-def share_of_known(solution: Solution, known: WeightedStart) -> Array:
-    """6x6 part of the covariance of the solution's left twist that comes from what was known of the pose: C K C.
+def share_of_start(solution: Solution, start: WeightedStart) -> Array:
+    """6x6 part of the covariance of the solution's left twist that comes from the start's pose: C K C.
 
-    C = (D + K)^-1 without the shared errors that `pose_covariance` adds: they come from the data.
+    K is the start's precision, D the information of the data, C = (D + K)^-1. The shared errors that `pose_covariance`
+    adds are left out, because they come from the data.
     """
-    joint = solution.weight * curvature(solution.data, OPEN_DIRECTION, OPEN_BELOW) + known.joint()
+    joint = solution.weight * curvature(solution.data, OPEN_DIRECTION, OPEN_BELOW) + start.joint()
     C = np.linalg.inv(joint)[:6, :6]
-    return np.asarray(C @ known.precision @ C)
+    return np.asarray(C @ start.precision @ C)
 
 
-def inflated(covariance: Array, of_known: Array, factor: float) -> Array:
-    """Covariance of an estimate whose data are noisier than it took them for, while what was known is as it said.
+def inflated(covariance: Array, of_start: Array, factor: float) -> Array:
+    """Covariance of an estimate whose data have sigmas `factor` times as large as assumed; the start's are right.
 
-    With sigmas `factor` times as large the data count for less, but the estimate had weighted them as if they were
-    good: C' = C (f^2 D + K) C = f^2 C - (f^2 - 1) C K C, of what the data say alone f^2.
+    The estimate weighted the data by the assumed sigmas: C' = C (f^2 D + K) C = f^2 C - (f^2 - 1) C K C. The part that
+    comes from the data grows by f^2.
 
     Args:
         covariance: 6x6 as computed.
-        of_known: 6x6 part of it that comes from what was known, C K C.
+        of_start: 6x6 part of it that comes from the start, C K C.
         factor: f, at least 1.
     Returns:
         6x6, nowhere less than the covariance.
     """
-    return np.asarray(covariance + (factor**2 - 1) * (covariance - of_known))
+    return np.asarray(covariance + (factor**2 - 1) * (covariance - of_start))
 
 
 def error_gradients(forward: Pairs, backward: Pairs, at: State) -> tuple[Array, Array]:
-    """What each shared error of the source's, and of the target's, points adds to the gradient of `two_way`.
+    """Change of the gradient of `two_way` per unit of each shared error of the source's, and of the target's, points.
 
-    Partners are held, as in the Gauss-Newton information: -J' Q dd for a displacement dd of rows minus partners.
+    Partners are held fixed, as in the Gauss-Newton information: -J' Q dd for a displacement dd of rows minus partners.
 
     Returns:
         Two (6 + errors, 8) arrays over the unknowns of `at`, per unit of each mode.

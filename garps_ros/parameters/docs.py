@@ -26,6 +26,7 @@ GROUPS = {
     "lifting": ("`lifting`", "The sensor model: how a pixel with depth becomes a Gaussian."),
     "start": ("`start`", "The pose that an alignment begins from."),
     "alignment": ("`alignment`", "The objective, how it is maximised, and what a pose must fulfil."),
+    "paper": ("`paper`", "The published method, used where `method` is paper."),
     "": ("The estimator as a whole", "Device, arithmetic and random numbers."),
 }
 OTHER_PRESETS = tuple(name for name in PRESETS if name not in ("default", "sensor"))

@@ -17,7 +17,7 @@ def test_no_difference_is_zero_and_seeded() -> None:
 
 
 def test_the_interval_is_that_of_the_normal_law() -> None:
-    """Of a mean of many values it is +-1.96 standard errors of the differences, which pairing makes small."""
+    """For a mean of many values it is +-1.96 standard errors of the differences, which pairing makes small."""
     rng = np.random.default_rng(5)
     common, own = rng.normal(10, 5, 400), rng.normal(0.1, 0.5, 400)
     found = paired_difference(common + own, common)

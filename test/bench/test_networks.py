@@ -7,6 +7,7 @@ import typer
 from torch import nn
 
 from bench.machine.flop import counted_flop
+from bench.networks import __main__ as networks
 from bench.networks.__main__ import BAR_SHARE, MATRIX, Case, chosen, measured
 from bench.networks.pair import STAGES, measured_pair
 from garps_core.models import depth_anything
@@ -24,6 +25,7 @@ def test_products_convolutions_and_attention_are_counted():
 
 def test_a_line_of_the_table(monkeypatch):
     monkeypatch.setattr(depth_anything, "SHORT_SIDE", 42)
+    monkeypatch.setattr(networks, "MULTIPLICATIONS", 1)
     before = torch.get_num_threads()
     try:
         row = measured(Case("depth-anything", "vits", 2, 40, 60), runs=1, threads=1)

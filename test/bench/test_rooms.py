@@ -41,7 +41,7 @@ def sift(rgb):
 
 
 def test_same_seed_same_bytes_other_seed_other_room(pair):
-    rooms.pair._cached_room.cache_clear()
+    rooms.room_pair._cached_room.cache_clear()
     again = rooms.make_pair(1, 3, **SIZE)
     for name in ("rgb0", "rgb1", "depth0", "depth1", "labels0", "labels1", "K0", "K1", "T_1_0"):
         assert getattr(pair, name).tobytes() == getattr(again, name).tobytes(), name
@@ -118,7 +118,7 @@ def test_feature_matches_obey_the_truth(pair):
 
 
 def test_render_outside_sees_nothing_behind_and_noise_is_seeded():
-    room = rooms.pair._cached_room(1, 1.0)
+    room = rooms.room_pair._cached_room(1, 1.0)
     K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
     away = rooms.look_at(np.array([-2.0, 1.0, 1.5]), np.array([-9.0, 1.0, 1.0]))
     nothing = room.render(away, K, 64, 48)

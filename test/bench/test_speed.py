@@ -96,7 +96,7 @@ def test_the_papers_solver_gets_the_same_components_and_its_own_number_of_pairs(
     held = contest(inputs)
     x, y = held.mixtures["second order"][0], held.mixtures["paper"][0]
     assert x.means is y.means and x.covariances is y.covariances and np.ptp(y.weights) == 0 < np.ptp(x.weights)
-    assert held.configs["paper"].alignment == Config.preset("paper").alignment
+    assert held.configs["paper"].paper == Config.preset("paper").paper
     assert len(held.paper_pairs().means) == -(-len(x) // 32)
     assert any(f"{len(held.paper_pairs().means)} rows" in note for note in section.notes)
     assert all(check.at_least for check in section.checks) and len(section.checks) == 5
@@ -169,11 +169,11 @@ def test_threads_are_put_back():
 
 def test_bars_and_verdicts_reach_the_files(tmp_path):
     checks = [Check("a", 2.0, 1.0), Check("b", 2.0, 1.0, at_least=True), Check("c", 3.0)]
-    sections = {"x": Section("X", checks, [{"n": 1, "s": 0.123456}], ["a remark"])}
+    sections = {"x": Section("X", checks, [{"n": 1, "s": 0.123456}], ["a note"])}
     speed.write(tmp_path, sections, {"cpu": "one"})
     text = (tmp_path / "table.md").read_text()
     assert text == markdown(sections, {"cpu": "one"})
-    for line in ("| a | 2 | <= 1 | NO |", "| b | 2 | >= 1 | yes |", "| c | 3 |  |  |", "| 1 | 0.1235 |", "- a remark"):
+    for line in ("| a | 2 | <= 1 | NO |", "| b | 2 | >= 1 | yes |", "| c | 3 |  |  |", "| 1 | 0.1235 |", "- a note"):
         assert line in text
     held = json.loads((tmp_path / "run.json").read_text())
     assert [check["met"] for check in held["sections"]["x"]["checks"]] == [False, True, None]

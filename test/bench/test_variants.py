@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left out of GARPS is left out, and nothing else; a pair without a pose is a row."""
+"""A variant leaves its part out of GARPS and nothing else; a pair without a pose is a row."""
 
 from dataclasses import replace
 

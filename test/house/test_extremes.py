@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from garps_core import Config, Mixture, Prior, align_mixtures
-from garps_core.config import Rung
 from garps_core.geometry import se3_exp
 
 PAPER = {
-    "alignment.component_stride": 1,
-    "alignment.opacity_threshold": 0.0,
-    "alignment.ladder": (Rung(covariance_scale=90.0, components=1000, neighbours=30, steps=5),),
+    "paper.component_stride": 1,
+    "paper.opacity_threshold": 0.0,
+    "paper.steps": 5,
 }
 CONFIGS = {
     "sensor": Config(),

@@ -229,7 +229,7 @@ def test_what_is_not_finite_is_a_status(files: Files, tmp_path: Path, capsys: Ca
         ),
         (["--preset", "mast3r", "--start", "auto", "K"], "expected a two-view network to start with, one of mast3r"),
         (["--preset", "monocular", "--reconstruction", "two_view", "K"], "and start.method is auto: expected a two-v"),
-        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would promise too much"),
+        (["--preset", "default", "--reconstruction", "two_view", "--start", "mast3r", "K"], "would be too small"),
         (
             ["--preset", "mast3r", "K", "weights=dust3r-dpt"],
             "dust3r-dpt are weights of dust3r: expected some of mast3r",

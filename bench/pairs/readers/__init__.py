@@ -39,7 +39,7 @@ def load(
     Args:
         name: of `READERS`.
         folder: where it lies, in the layout that the reader's module describes.
-        limit: at most so many pairs, spread evenly; None = all.
+        limit: largest number of pairs, spread evenly; None = all.
         skipped: None = every file must be there; a list = pairs with missing files are left out and named in it.
         options: of the reader.
     Raises:

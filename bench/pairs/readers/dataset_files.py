@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readers share: bounded text, poses, images, and the rule that missing files are listed, never guessed."""
+"""Files as all readers read them: bounded text, poses, images; missing files are listed, never guessed."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def chosen(items: Sequence[Item], count: int, rng: np.random.Generator) -> list[
 
 
 def frame_gaps(lengths: dict[Item, int], gap: int) -> list[tuple[Item, int]]:
-    """Every (sequence, first frame) that has a frame `gap` later, of sequences with so many frames."""
+    """Every (sequence, first frame) that has a frame `gap` later, by the number of frames of each sequence."""
     if gap < 1:
         raise ValueError(f"gap is {gap}: expected at least 1 frame")
     return [(name, i) for name, length in lengths.items() for i in range(length - gap)]

@@ -47,7 +47,7 @@ def read(folder: Path, *, limit: int | None = None, skipped: list[str] | None = 
 
     Args:
         folder: with the scenes.
-        limit: at most so many, spread evenly; all of `val` take about 10 GB.
+        limit: largest number of pairs, spread evenly; all of `val` take about 10 GB.
         skipped: a list to name pairs with missing images in, instead of raising.
         every: take every so-many-th query.
     Raises:

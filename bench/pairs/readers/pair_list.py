@@ -104,7 +104,7 @@ class Record:
 
     @property
     def scale_text(self) -> str:
-        """What `Pair.scale` says: "raw", or "sfm-depth x1.234"."""
+        """The text for `Pair.scale`: "raw", or "sfm-depth x1.234"."""
         return self.scale_source if self.scale_source == RAW else f"{self.scale_source} x{self.scale:.4g}"
 
 
@@ -167,7 +167,7 @@ def read(
 
     Args:
         folder: of the data set.
-        limit: at most so many, spread evenly.
+        limit: largest number of pairs, spread evenly; None = all.
         skipped: a list to name pairs with missing images in, instead of raising.
         list_file: the list, relative to the folder.
         name: of the set.

@@ -29,7 +29,7 @@ TRUTH_REACH = {
     ("tum_fr1_rpy", "small"): (0.017, 0.7),
     ("tum_fr1_rpy", "large"): (0.017, 0.7),
 }
-"""How far each set's own truth can be trusted, m and deg (the sets' README); generated pairs are exact."""
+"""Accuracy of each set's own truth, m and deg (from the sets' README); generated pairs are exact."""
 
 
 def truth_covariance(pair: Pair) -> Float64Array:
@@ -62,7 +62,7 @@ def read_pairs(name: str, folder: Path, limit: int | None = None, half: str = "a
 
 
 def ids_of_half(ids: Iterable[str], half: str) -> set[str]:
-    """Which pairs belong to a half of `HALVES`, by their ids alone: sorted by CRC-32, they alternate."""
+    """Ids of the pairs of a half of `HALVES`, by the ids alone: sorted by CRC-32, they alternate."""
     if half not in HALVES:
         raise ValueError(f"half is {half!r}: expected one of {', '.join(HALVES)}")
     mixed = sorted(ids, key=lambda name: (zlib.crc32(name.encode()), name))

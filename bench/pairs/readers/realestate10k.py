@@ -43,7 +43,7 @@ from garps_core.geometry import se3_inverse, transform
 NAME = "realestate10k"
 FIRST, LAST = 0, 29
 SPLITS = {"test": ("test", 100), "validation": ("train", 10)}
-"""Which tracks a list is drawn from, and how many pairs of each category."""
+"""Folder of tracks that a list is drawn from, and pairs of each category."""
 SCALES = (RAW, SOURCE)
 COLUMNS = "timestamp fx fy cx cy k1 k2 r11 r12 r13 t1 r21 r22 r23 t2 r31 r32 r33 t3"
 LAYOUT = "cameras/SPLIT/CLIP.txt and frames/CLIP/TIMESTAMP.jpg or .png"

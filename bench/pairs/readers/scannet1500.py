@@ -51,7 +51,7 @@ def read(folder: Path, *, limit: int | None = None, skipped: list[str] | None = 
 
     Args:
         folder: of the release.
-        limit: at most so many, spread evenly; all 1500 with depth take about 7 GB.
+        limit: largest number of pairs, spread evenly; all 1500 with depth take about 7 GB.
         skipped: a list to name pairs with missing files in, instead of raising.
         depth: False reads colour only; then there are no true points.
     Raises:

@@ -57,7 +57,7 @@ def read(
 
     Args:
         folder: one scene.
-        limit: at most so many of them, spread evenly.
+        limit: largest number of them, spread evenly.
         skipped: a list to name pairs with missing files in, instead of raising.
         gap: frames between source and target.
         count: pairs drawn.

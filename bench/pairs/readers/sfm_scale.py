@@ -24,7 +24,7 @@ MIN_POINTS = 10
 
 
 def depth_scale(depth: Float32Array, K: Float64Array, points: Float64Array, rng: np.random.Generator) -> float:
-    """What to multiply the clip's unit with.
+    """The factor from the clip's unit to metres.
 
     Args:
         depth: HxW m along z, NaN = no reading.

@@ -86,7 +86,7 @@ def read(
 
     Args:
         folder: one sequence.
-        limit: at most so many of them, spread evenly.
+        limit: largest number of them, spread evenly.
         skipped: a list to name pairs with missing images in, instead of raising.
         gap: frames (those that have depth and truth) between source and target.
         count: pairs drawn.

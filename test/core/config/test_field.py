@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A setting knows its meaning, unit, range and choices; a settings class checks its own fields."""
 
+import re
 from dataclasses import dataclass, fields
+from typing import Any
 
 import pytest
 
+from garps_core.config import Alignment, Config, Lifting, Reconstruction, Rung, Start
 from garps_core.config.field import Checked, description, setting
 from garps_core.errors import ConfigError
+from garps_ros.parameters.settings import NodeSettings
 
 INSTALLED = ["candle"]
 
@@ -23,3 +27,32 @@ def test_choices_may_be_a_function_that_is_called_when_they_are_needed() -> None
     INSTALLED.append("torch")
     assert Lamp("torch").kind == "torch"
     assert description(kind)["choices"] == ("candle", "torch")
+
+
+RETIRED = re.compile(
+    r"\b(glances?|sight|sharpen(s|ed)?|beliefs?|beginnings?|systematic|remarks?|troubles?|doubts?|likewise|descends?"
+    r"|climbs?|fit_brightness|worth|initial|says|told|so many)\b",
+    re.IGNORECASE,
+)
+CLASSES = (Config, Reconstruction, Lifting, Start, Alignment, Rung, NodeSettings)
+SETTINGS = {f"{kind.__name__}.{f.name}": f for kind in CLASSES for f in fields(kind) if "doc" in f.metadata}
+FULL_NAMES = {*Config().settings(), *(f.name for f in fields(NodeSettings))}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_text_of_a_setting_is_complete_in_itself(name: str) -> None:
+    """`ros2 param describe` prints it alone."""
+    f: Any = SETTINGS[name]
+    text: str = f.metadata["doc"]
+    words = re.findall(r"[A-Za-z0-9_]+", text.lower())
+    assert text[0].isalpha() and len(words) >= 4, "a noun phrase or a sentence"
+    assert words[0] not in ("of", "what", "as", "which", "so", "where", "how", "whose", "that"), "begins in the middle"
+    assert not RETIRED.search(text)
+    assert {*re.findall(r"`([^`]+)`", text)} <= FULL_NAMES, "a setting is named with its part"
+    if f.default == "":
+        assert "empty = " in text, "says the meaning of its default"
+
+
+def test_settings_that_are_off_at_zero_say_so() -> None:
+    for name in ("NodeSettings.max_rate", "Lifting.smoothing_px", "Alignment.brightness_measurements"):
+        assert "0 = " in SETTINGS[name].metadata["doc"]

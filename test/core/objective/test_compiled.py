@@ -22,7 +22,6 @@ from garps_core.objective import compiled, loops, neighbours, pairs, plain
 from garps_core.objective.backend import Backend
 from garps_core.objective.packed import moved_rows
 from garps_core.objective.pairs import pair_up, thin, to_device, visible, without_floor
-from garps_core.objective.plain import image_coordinates
 from garps_core.objective.shape import evaluate
 from garps_core.objective.with_depth_errors import corrected
 
@@ -189,14 +188,11 @@ def neighbours_of(kind, where):
 
 
 @needs_numba
-@pytest.mark.parametrize("depth_weight", [1.0, 0.3, 0.01])
 @pytest.mark.parametrize("where", ["among them", "beside", "far", "behind"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_neighbours_are_those_of_the_tree(kind, where, depth_weight):
+def test_neighbours_are_those_of_the_tree(kind, where):
     rows, partners = neighbours_of(kind, where)
-    index, distance = neighbours.nearest(rows.numpy(), partners.numpy(), 12, depth_weight)
-    if depth_weight < 1:
-        rows, partners = image_coordinates(rows, depth_weight), image_coordinates(partners, depth_weight)
+    index, distance = neighbours.nearest(rows.numpy(), partners.numpy(), 12)
     rows, partners = rows.double().numpy(), partners.double().numpy()
     expected, _ = cKDTree(partners).query(rows, k=12)
     scale = np.abs(rows).max()  # differences of float32 coordinates
@@ -207,13 +203,12 @@ def test_neighbours_are_those_of_the_tree(kind, where, depth_weight):
 
 
 @needs_numba
-@pytest.mark.parametrize("depth_weight", [1.0, 0.3])
-def test_all_partners_are_neighbours_where_all_are_asked_for(depth_weight):
+def test_all_partners_are_neighbours_where_all_are_asked_for():
     rows, partners = (part[:60].contiguous() for part in neighbours_of("scattered", "among them"))
-    index, distance = neighbours.nearest(rows.numpy(), partners.numpy(), 60, depth_weight)
+    index, distance = neighbours.nearest(rows.numpy(), partners.numpy(), 60)
     np.testing.assert_array_equal(np.sort(index, axis=1), np.tile(np.arange(60), (60, 1)))
     assert (np.diff(distance, axis=1) >= 0).all()
-    one, none = neighbours.nearest(rows.numpy(), partners[:1].numpy(), 1, depth_weight)
+    one, none = neighbours.nearest(rows.numpy(), partners[:1].numpy(), 1)
     assert not one.any() and (none > 0).all()
 
 
@@ -222,7 +217,7 @@ def test_partners_behind_their_camera_are_left_to_the_tree():
     """Cells of an image cannot hold them; the answer is right all the same."""
     rows, partners, T = clouds("scattered")
     behind = replace(partners, means=partners.means - torch.tensor([0, 0, 3.0]))
-    _, distance = pairs._nearest(rows, behind, T, 5, 1.0)
+    _, distance = pairs._nearest(rows, behind, T, 5)
     moved = rows.means.double().numpy() @ T[:3, :3].T + T[:3, 3]
     expected, _ = cKDTree(behind.means.double().numpy()).query(moved, k=5)
     np.testing.assert_allclose(distance.numpy(), expected, rtol=CLOSE, atol=1e-6)

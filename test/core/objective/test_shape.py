@@ -319,17 +319,6 @@ def test_nearest_neighbours_are_the_nearest():
     np.testing.assert_allclose(pairs.partner_means.permute(2, 1, 0).numpy(), expected, atol=1e-15)
 
 
-def test_with_a_small_depth_weight_the_partner_lies_on_the_same_ray():
-    """Every row has one partner on its ray at 1.3 times its range, and others nearer to it in space."""
-    rows = replace(ROWS, means=ROWS.means * (1, 1, 0) + (0, 0, 2))
-    partners = replace(rows, means=rows.means * 1.3)
-    weighted = replace(SETTINGS, depth_weight=0.01)
-    pairs = all_pairs(rows, partners, np.eye(4), k=1, alignment=weighted)
-    np.testing.assert_allclose(pairs.partner_means[:, 0].T.numpy(), partners.means, atol=1e-15)
-    in_space = all_pairs(rows, partners, np.eye(4), k=1)
-    assert not np.allclose(in_space.partner_means[:, 0].T.numpy(), partners.means)
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_scale_of_the_weights_does_not_matter(form):
     heavy = replace(ROWS, weights=1000 * ROWS.weights)

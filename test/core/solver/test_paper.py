@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from surfaces import FREE, random_pose
+from surfaces import FREE, TRUTH, disturbed, off, random_pose, two_mixtures
 
 from bench.peers.autograd import PlainObjective, rotation
 from garps_core import Config, Mixture, Prior, Status, align_mixtures
@@ -91,17 +91,16 @@ def published():
 
 @pytest.fixture(scope="module")
 def pairs():
-    return paper.paper_pairs(to_device(SOURCE, PAPER), to_device(TARGET, PAPER), START, PAPER.alignment)
+    return paper.paper_pairs(to_device(SOURCE, PAPER), to_device(TARGET, PAPER), START, PAPER.paper)
 
 
 def test_the_numbers_are_the_published_ones():
-    settings = PAPER.alignment
-    (rung,) = settings.ladder
-    assert (settings.semantic_discount, rung.covariance_scale, settings.colour_variance) == (0.92, 90, 0.4)
+    settings = PAPER.paper
+    assert (settings.semantic_discount, settings.covariance_scale, settings.colour_variance) == (0.92, 90, 0.4)
     assert (settings.opacity_threshold, settings.component_stride) == (0.5, 32)
-    assert (rung.neighbours, settings.max_distance_m) == (30, 2.5)
-    assert (settings.adam_rate_translation, settings.adam_rate_rotation) == (9e-5, 3e-6)
-    assert settings.solver == "adam" and settings.depth_weight == 1 and PAPER.lifting.weighting == "equal"
+    assert (settings.neighbours, settings.max_distance_m) == (30, 2.5)
+    assert (settings.rate_translation, settings.rate_rotation, settings.steps) == (9e-5, 3e-6, 1000)
+    assert PAPER.method == "paper" and PAPER.lifting.weighting == "equal"
 
 
 def test_candidate_pairs_are_the_published_ones(pairs, published):
@@ -126,7 +125,7 @@ def test_value_and_gradient_are_those_of_the_published_objective(seed, pairs, pu
 
 def test_every_step_is_that_of_adam_on_the_published_objective(pairs, published):
     expected, values = published.path(START, STEPS)
-    got = paper.adam_path(pairs, START, PAPER.alignment, STEPS)
+    got = paper.adam_path(pairs, START, PAPER.paper, STEPS)
     assert len(got) == STEPS + 1
     for step, (a, b) in enumerate(zip(got, expected, strict=True)):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10, err_msg=f"step {step}")
@@ -135,13 +134,52 @@ def test_every_step_is_that_of_adam_on_the_published_objective(pairs, published)
 
 
 def test_the_whole_estimate_ends_where_the_reference_does(published):
-    one_rung = (replace(PAPER.alignment.ladder[0], steps=STEPS),)
-    prior = Prior(START, FREE)
-    estimate = align_mixtures(SOURCE, TARGET, prior, PAPER.replace({"alignment.ladder": one_rung}))
+    estimate = align_mixtures(SOURCE, TARGET, Prior(START, FREE), PAPER.replace({"paper.steps": STEPS}))
     expected, values = published.path(START, STEPS)
     np.testing.assert_allclose(estimate.T_target_source, expected[-1], rtol=0, atol=1e-10)
     assert np.exp(estimate.objective) == pytest.approx(values[-1], rel=1e-10)
-    assert estimate.status is Status.CONVERGED and estimate.iterations == STEPS
+    assert estimate.iterations == STEPS
+
+
+def aligned(twist):
+    """The paper's estimate of two views of the wavy surface, from a start that is off by a twist."""
+    config = Config.preset("paper").replace({"paper.component_stride": 4, "paper.steps": 100})
+    start = disturbed(twist=np.asarray(twist), covariance=FREE)
+    return align_mixtures(*two_mixtures(config=config), start, config)
+
+
+def test_a_good_start_gives_a_converged_pose():
+    estimate = aligned([0.01, -0.01, 0.01, 0.002, -0.002, 0.002])
+    assert estimate.ok and off(estimate.T_target_source, TRUTH)[0] < 0.03
+    assert "the paper's fixed number of steps, 100" in estimate.reason
+
+
+@pytest.mark.parametrize("twist", [[0, 0, 0.2, 0, 0, 0], [0.2, 0, 0, 0, 0, 0], [0.2, 0.1, 0, 0.02, -0.06, 0]])
+def test_a_wrong_start_gives_no_converged_pose(twist):
+    """Adam moves by centimetres, so the pose is as wrong as the start."""
+    estimate = aligned(twist)
+    assert off(estimate.T_target_source, TRUTH)[0] > 0.1
+    assert estimate.status is Status.POOR_FIT and "of the components found a partner" in estimate.reason
+
+
+def test_a_wrong_start_with_small_sigmas_is_inconsistent_once_the_pose_moves_away():
+    config = Config.preset("paper").replace({"paper.component_stride": 4, "paper.steps": 100})
+    start = disturbed(twist=np.array([0.05, 0, 0.05, 0, 0, 0]), covariance=1e-4 * FREE)
+    estimate = align_mixtures(*two_mixtures(config=config), start, config)
+    assert estimate.status is Status.INCONSISTENT and "sigmas away from the start" in estimate.reason
+
+
+def test_views_that_share_little_have_no_pose():
+    estimate = aligned([0, 0, 0, 0, 1.5, 0])
+    assert estimate.status is Status.LOW_OVERLAP and estimate.T_target_source is None
+
+
+def test_only_its_own_settings_count():
+    """The ladder and the pairing of the default method have no effect on the published one."""
+    changed = {"alignment.ladder": Config().alignment.ladder[:1], "alignment.colour_variance": 100.0}
+    short = PAPER.replace({"paper.steps": 3})
+    one, other = (align_mixtures(SOURCE, TARGET, Prior(START, FREE), c) for c in (short, short.replace(changed)))
+    assert one.T_target_source.tobytes() == other.T_target_source.tobytes()
 
 
 def test_neighbours_leave_out_only_what_is_small(published):
@@ -154,7 +192,7 @@ def test_neighbours_leave_out_only_what_is_small(published):
 
 
 def test_the_threshold_counts_before_the_stride():
-    chosen = paper.salient(to_device(SOURCE, PAPER), PAPER.alignment)
+    chosen = paper.salient(to_device(SOURCE, PAPER), PAPER.paper)
     kept = np.flatnonzero(SOURCE.weights >= 0.5)[::32]
     np.testing.assert_array_equal(chosen.means.numpy(), SOURCE.means[kept])
     assert chosen.weights.sum().item() == pytest.approx(1)
@@ -169,7 +207,7 @@ def test_too_few_salient_components_are_no_pose_and_say_so():
 
 def test_without_labels_every_pair_counts_in_full(pairs):
     plain = [to_device(replace(mixture, labels=None), PAPER) for mixture in (SOURCE, TARGET)]
-    more = paper.paper_pairs(*plain, START, PAPER.alignment)
+    more = paper.paper_pairs(*plain, START, PAPER.paper)
     gain = (more.log_weights - pairs.log_weights)[torch.isfinite(pairs.log_weights)].numpy()
     same = np.abs(gain) < 1e-12
     np.testing.assert_allclose(gain[~same], -np.log(0.92), atol=1e-12)
@@ -177,6 +215,6 @@ def test_without_labels_every_pair_counts_in_full(pairs):
 
 
 def test_the_start_is_where_the_path_starts(pairs):
-    np.testing.assert_allclose(paper.adam_path(pairs, START, PAPER.alignment, 0)[0], START)
+    np.testing.assert_allclose(paper.adam_path(pairs, START, PAPER.paper, 0)[0], START)
     back = se3_inverse(START)
-    assert not np.allclose(paper.adam_path(pairs, back, PAPER.alignment, 1)[1], START)
+    assert not np.allclose(paper.adam_path(pairs, back, PAPER.paper, 1)[1], START)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances mean what they say: in the ROS convention, for the inverse pose, and against repeated noise."""
+"""Covariances are right: in the ROS convention, for the inverse pose, and against repeated noise."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def random_covariance(seed, sigma=0.01):
 
 
 def drawn(covariance, T, seed=0):
-    """Of poses exp(twist) T, twists of the covariance: shifts and rotations about fixed axes (n, 6)."""
+    """Shifts and rotations about fixed axes (n, 6) of random poses exp(twist) T; the twists have the covariance."""
     twists = np.random.default_rng(seed).multivariate_normal(np.zeros(6), covariance, size=DRAWS)
     turns = Rotation.from_rotvec(twists[:, 3:])
     cross = np.cross(twists[:, 3:], np.cross(twists[:, 3:], T[:3, 3]))  # the exponential, to second order
@@ -48,7 +48,7 @@ def apart(a, b):
 
 
 def test_the_sampling_follows_the_exponential():
-    """So that the Monte Carlo below tests the package and not itself."""
+    """The Monte Carlo below then tests the package and not itself."""
     twists = np.random.default_rng(0).multivariate_normal(np.zeros(6), random_covariance(5), size=DRAWS)
     errors = drawn(random_covariance(5), FAR_POSE)
     for twist, error in zip(twists[:20], errors, strict=False):
@@ -143,9 +143,9 @@ def test_a_scale_error_moves_the_camera_along_its_view():
 
 
 def test_a_tight_prior_is_kept_and_makes_the_pose_certain(plain):
-    known = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
+    precise = np.diag([1e-3**2] * 3 + [5e-4**2] * 3)
     own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
-    prior = disturbed(twist=np.zeros(6), covariance=known)
+    prior = disturbed(twist=np.zeros(6), covariance=precise)
     tight = estimated(Config().replace(own), prior)
     assert (sigmas(tight) <= np.sqrt(np.diag(prior.covariance)) * 1.0001).all()
     assert (sigmas(tight) < 0.4 * sigmas(plain)).all()
@@ -163,7 +163,7 @@ def test_noisier_data_spread_a_linear_estimate_as_the_inflated_covariance_says(f
     assert apart(inflated(C, C @ K @ C, factor), np.cov(found.T)) < 0.03
 
 
-def test_inflation_leaves_what_is_known():
+def test_inflation_leaves_the_part_of_the_start():
     C = random_covariance(3)
     np.testing.assert_array_equal(inflated(C, 0.3 * C, 1.0), C)
     np.testing.assert_allclose(inflated(C, np.zeros((6, 6)), 3.0), 9 * C, rtol=1e-12)
@@ -171,7 +171,7 @@ def test_inflation_leaves_what_is_known():
 
 
 @pytest.mark.parametrize("depth_errors", [False, True])
-def test_shared_errors_are_inflated_as_the_data_they_come_from(depth_errors):
+def test_shared_errors_are_inflated_with_the_data_they_come_from(depth_errors):
     """A scale error of 5 % is most of the covariance, beside a vague start."""
     config = Config().replace({"alignment.depth_errors": depth_errors, "lifting.scale_sigma": 0.05})
     vague = disturbed(covariance=100 * FREE)
@@ -184,14 +184,14 @@ def test_an_inflated_estimate_is_the_same_pose_with_larger_sigmas(plain):
     vague = estimated(Config().replace({"lifting.sigma_inflation": 3.0}))
     np.testing.assert_array_equal(vague.T_target_source, plain.T_target_source)
     assert (sigmas(vague) > 2.5 * sigmas(plain)).all() and (sigmas(vague) <= 3.0001 * sigmas(plain)).all()
-    known = disturbed(twist=np.zeros(6), covariance=np.diag([5e-5**2] * 3 + [2e-5**2] * 3))
+    start = disturbed(twist=np.zeros(6), covariance=np.diag([5e-5**2] * 3 + [2e-5**2] * 3))
     own = {"lifting.scale_sigma": 0.0, "lifting.warp_sigma": 0.0, "lifting.pointing_sigma_rad": 0.0}
-    tight = estimated(Config().replace(own | {"lifting.sigma_inflation": 3.0}), known)
-    assert (sigmas(tight) <= np.sqrt(np.diag(known.covariance)) * 1.1).all(), "what was known stays"
+    tight = estimated(Config().replace(own | {"lifting.sigma_inflation": 3.0}), start)
+    assert (sigmas(tight) <= np.sqrt(np.diag(start.covariance)) * 1.1).all(), "the start stays"
 
 
 def test_the_direction_along_a_corridor_is_the_most_uncertain():
-    """A groove that runs along y: only its ends and the texture, here none, tell where along it one is."""
+    """The groove runs along y and has no texture: only its ends tell where along it the camera is."""
 
     def groove(x, y):
         return 2.5 + 0.3 * np.sin(4 * x) + 0 * y
@@ -203,7 +203,7 @@ def test_the_direction_along_a_corridor_is_the_most_uncertain():
 
 
 def noisy(view, config, rng):
-    """The view with depth as `Lifting` believes it to be: white noise and the smooth modes."""
+    """The view with depth errors as `Lifting` models them: white noise and the smooth modes."""
     lifting = config.lifting
     v, u = np.mgrid[: view.depth.shape[0], : view.depth.shape[1]].astype(float)
     slopes = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
@@ -233,7 +233,7 @@ def test_pointing_errors_shift_the_pose():
 
 @pytest.mark.parametrize("exaggeration", [1, 4])
 def test_repeated_noise_spreads_the_estimates_no_more_than_predicted(exaggeration):
-    """Thirty draws of depth as the noise model has it, once also four times as bad; the roll is better than claimed."""
+    """Thirty draws from the noise model, once with four times its sigmas; the roll is better than claimed."""
     config = Config()
     lifting = config.lifting
     names = ("noise_floor_m", "noise_linear", "scale_sigma", "warp_sigma")
@@ -254,7 +254,7 @@ def test_repeated_noise_spreads_the_estimates_no_more_than_predicted(exaggeratio
 
 
 def test_a_prior_counts_once():
-    """Data that says nothing about the pose: what is left is the prior, not the prior twice."""
+    """The data says nothing about the pose, so the estimate is the prior, not the prior twice."""
     rng = np.random.default_rng(0)
     far = rng.uniform((-1, -1, 2), (1, 1, 4), (200, 3))
 
@@ -268,7 +268,7 @@ def test_a_prior_counts_once():
 
 
 def test_the_surface_is_seen_where_it_is():
-    """The ground the Monte Carlo stands on: both views' points lie on the surface the world has."""
+    """The Monte Carlo depends on it: a view's points lie on the surface of the world."""
     view = look(TRUTH)
     means = (
         reconstruct(view, Config().replace({"lifting.smoothing_px": 0})).means.astype(float) @ TRUTH[:3, :3].T

@@ -11,7 +11,7 @@ from surfaces import TRUTH, disturbed, look, off, room
 from garps_core import Config, Mixture, Prior, Status, estimate_relative_pose
 from garps_core.config import Alignment
 from garps_core.geometry import ros_from_twist, se3_exp
-from garps_core.verdict.status import quality, relative_uncertainty, verdict
+from garps_core.verdict.status import FIXED_STEPS_SUPPORT, quality, relative_uncertainty, verdict
 
 SETTINGS = Alignment()
 WIDE = np.diag([0.3**2] * 3 + [0.2**2] * 3)
@@ -92,9 +92,9 @@ def test_the_gravest_comes_first():
     assert "partner" in order[1][1] and "brightness" in order[2][1]
 
 
-def test_a_fixed_number_of_steps_has_converged_and_its_support_is_ignored():
+def test_a_fixed_number_of_steps_has_converged():
     expected = "the paper's fixed number of steps, 17, 0.7 sigmas from the start"
-    assert status_of(candidate(support=0.0, fixed_steps=True)) == (Status.CONVERGED, expected)
+    assert status_of(candidate(fixed_steps=True)) == (Status.CONVERGED, expected)
 
 
 @pytest.mark.parametrize(
@@ -102,19 +102,12 @@ def test_a_fixed_number_of_steps_has_converged_and_its_support_is_ignored():
     [
         ({}, Prior(np.eye(4), WIDE / 400, "given"), 0.01, Status.INCONSISTENT),
         ({"correlation": 0.5}, START, 0.01, Status.POOR_FIT),
-        ({"correlation": None}, START, 0.01, Status.POOR_FIT),
+        ({"support": FIXED_STEPS_SUPPORT - 0.01}, START, 0.01, Status.POOR_FIT),
         ({}, START, 0.0712, Status.DEGENERATE),
     ],
 )
 def test_a_fixed_number_of_steps_is_judged_as_any_other_solution(fault, start, uncertainty, status):
     assert status_of(candidate(**fault, fixed_steps=True), start, uncertainty=uncertainty)[0] is status
-
-
-def test_a_guess_needs_partners_or_brightness():
-    alone = candidate(correlation=None, fixed_steps=True)
-    _, reason = status_of(alone)
-    assert reason.startswith("neither partners nor brightness were compared, expected one of them after this start")
-    assert status_of(alone, guess=False)[0] is Status.CONVERGED
 
 
 def test_relative_uncertainty_is_a_share_of_the_range():

@@ -22,7 +22,7 @@ NODES = {
     "busy_term": (signal.SIGTERM, True),
 }
 CHEAP = ["-p", "lifting.stride:=4"]
-COSTLY = "preset: paper\nlifting.stride: 1\nalignment.component_stride: 1\n"
+COSTLY = "preset: paper\nlifting.stride: 1\npaper.component_stride: 1\n"
 """Settings of a computation of a thousand steps over all components: still under way when the second signal comes."""
 
 

@@ -126,7 +126,8 @@ def test_values_reach_the_settings() -> None:
     node, config = settings_from(values_of("paper", sync_slop=0.5, lifting__stride=7, device="cuda:0"))
     assert node.sync_slop == 0.5 and node.preset == "paper"
     assert config == Config.preset("paper").replace({"lifting.stride": 7, "device": "cuda:0"})
-    assert config.alignment.ladder == Config.preset("paper").alignment.ladder != Config().alignment.ladder
+    monocular = settings_from(values_of("monocular"))[1]
+    assert monocular.alignment.ladder == Config.preset("monocular").alignment.ladder != Config().alignment.ladder
 
 
 WRONG = {
@@ -222,8 +223,8 @@ def test_the_page_has_a_row_for_every_parameter() -> None:
         "| `lifting.noise_linear` | double | `0.003`; time_of_flight `0.001`; structured_light `0.0`; stereo `0.0`;"
     )
     assert row.startswith(expected)
-    (row,) = [row for row in rows if "`alignment.max_prior_sigmas`" in row]
-    assert "`8.0`; paper `1000000.0`" in row
+    (row,) = [row for row in rows if "`alignment.effective_measurements`" in row]
+    assert "`30.0`; monocular `5.0`" in row
 
 
 def test_the_file_is_one_screen() -> None:
