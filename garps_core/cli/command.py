@@ -91,7 +91,7 @@ def align(
     K: Annotated[Four | None, typer.Option("--K", help="Intrinsics of images, px.", metavar="FX FY CX CY")] = None,
     K_target: Annotated[
         Four | None,
-        typer.Option("--K-target", help="Intrinsics of the target, if different, px.", metavar="FX FY CX CY"),
+        typer.Option("--K-target", help="Intrinsics of the target, px.", metavar="FX FY CX CY"),
     ] = None,
     depth_source: Annotated[
         Path | None, typer.Option(help="Depth registered to SRC: 16-bit PNG (mm), .npy or float TIFF (m).")
@@ -102,7 +102,7 @@ def align(
     ] = None,
     prior: Annotated[
         str | None,
-        typer.Option(help="Start pose T_target_source, metres and quaternion.", metavar='"X Y Z QX QY QZ QW"'),
+        typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"'),
     ] = None,
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')

@@ -20,13 +20,8 @@ from garps_ros import replay
 
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-<<<<<<< HEAD
-PLUGINS = ("two_view_models.md", "extending.md")
-"""Pages whose code is a package, installed and run by test_two_view_adapter.py and test_depth_networks.py."""
-=======
 TESTED_ELSEWHERE = ("two_view_models.md", "extending.md")
 """Pages whose code belongs to another distribution; tests of adapters and of depth networks run it."""
->>>>>>> docs
 FOLDERS = ("docs", "garps_core", "garps_ros", "msg_adapters", "bench", "test")
 FILES = [str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
 WEIGHTS_COMMANDS = ("list", "fetch", "verify", "convert", "check")
@@ -113,13 +108,9 @@ def test_the_command_line_example_works(
     assert (folder[0] / "pair.png").stat().st_size > 10_000
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize("path", [p for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in PLUGINS], ids=name)
-=======
 @pytest.mark.parametrize(
     "path", [p for p in sorted((ROOT / "docs").glob("*.md")) if p.name not in TESTED_ELSEWHERE], ids=name
 )
->>>>>>> docs
 def test_the_code_of_the_pages_runs(path: Path) -> None:
     space: dict = {}
     for block in blocks(path, "python"):
