@@ -92,8 +92,8 @@ def test_flash3d_stands_on_a_sensors_depth(files: dict[str, str], capsys: Captur
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--depth-source"], "the preset monocular, which asks a network"),
-        (["--preset", "sensor"], "the preset monocular, which asks a network"),
+        (["--depth-source"], "the preset monocular, whose depth comes from a network"),
+        (["--preset", "sensor"], "the preset monocular, whose depth comes from a network"),
         (["--preset", "sensor", "--reconstruction", "flash3d"], "whose depth is off by per cents"),
         (["--reconstruction", "ply"], "expected two images, or two splat files"),
         (["--set", "reconstruction.method=ply"], "garps align a.ply b.ply"),
