@@ -18,7 +18,7 @@ from garps_core.start.ransac import MIN_LENGTHS, pose_from_bearings, triangulate
 from garps_core.start.reprojection import (
     READINGS_AVERAGE,
     OneWay,
-    Seen,
+    Reprojected,
     across,
     inliers_of,
     reprojected,
@@ -46,7 +46,7 @@ def bearings(matches, config=None):
 def seen_with(along, residual):
     """Points of which only these two are asked for."""
     n = len(along)
-    return Seen(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2, 3)), along, residual)
+    return Reprojected(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2, 3)), along, residual)
 
 
 def as_measured(way, T):
