@@ -4,12 +4,14 @@ one pose; or identity."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from garps_core.config import Config
 from garps_core.config.combinations import check_start
 from garps_core.config.start import TWO_VIEW
-from garps_core.errors import InitialisationError, ModelError, WeightsError
+from garps_core.errors import InitialisationError, InputError, ModelError, WeightsError
 from garps_core.geometry import ros_from_twist, se3_exp, se3_inverse, se3_log, twist_from_ros
 from garps_core.models.in_use import Networks
 from garps_core.point_maps import PairMaps
@@ -110,7 +112,10 @@ def combined(given: Prior, features: Prior, max_contradiction: float) -> tuple[P
     left = of_features - gain @ of_features
     covariance = ros_from_twist(0.5 * (left + left.T), T)
     reason = f"{features.reason}, {sigmas:.1f} sigmas from the given prior"
-    return (Prior(T, covariance, f"{given.origin} and {features.origin}", reason),)
+    try:
+        return (Prior(T, covariance, f"{given.origin} and {features.origin}", reason),)
+    except InputError:  # covariances too many orders of magnitude apart for float64
+        return (replace(given, reason=f"too precise for the {features.origin} to add to it ({features.reason})"),)
 
 
 def identity(config: Config, reason: str) -> Prior:

@@ -19,6 +19,7 @@ from garps_core.config import Config
 from garps_core.depth_errors import error_sigmas
 from garps_core.errors import InitialisationError
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse
+from garps_core.start.degenerate import fixed_pose
 from garps_core.start.features import Matches
 from garps_core.start.ransac import pose_from_bearings, ransac
 from garps_core.start.reprojection import (
@@ -35,7 +36,11 @@ REFINEMENT_STEPS = 8
 
 
 def pose_from_matches(matches: Matches, source: View, target: View, config: Config, origin: str = "features") -> Prior:
-    """Pose with covariance from matches with depth. Raises InitialisationError with the counts when it cannot."""
+    """Return the pose with covariance that matches with depth give.
+
+    Raises:
+        InitialisationError: too few matches fit one pose, or those that do leave it open; with their counts.
+    """
     has_s, has_t = (np.isfinite(p[:, 0]) for p in (matches.source_points, matches.target_points))
     forward = OneWay(matches.source_points[has_s], matches.target_px[has_s], target.K)
     backward = OneWay(matches.target_points[has_t], matches.source_px[has_t], source.K)
@@ -55,9 +60,9 @@ def pose_from_matches(matches: Matches, source: View, target: View, config: Conf
     if count < need:
         raise InitialisationError(f"{len(matches)} feature matches, {count} fit one pose: expected at least {need}")
     ways = (keep(forward, inlier_f), keep(backward, inlier_b))
-    T, covariance = _refine(T, *ways, config)
     reason = f"{len(matches)} feature matches, {count} inliers"
-    return Prior(T, covariance, origin, reason)
+    with fixed_pose(reason):
+        return Prior(*_refine(T, *ways, config), origin, reason)
 
 
 def _inverse(T: Array | None) -> Array | None:

@@ -16,9 +16,10 @@ import numpy.typing as npt
 
 from garps_core.config import Config
 from garps_core.depth_errors import error_sigmas
-from garps_core.errors import InitialisationError, InputError
+from garps_core.errors import InitialisationError
 from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse, se3_log, transform
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
+from garps_core.start.degenerate import fixed_pose
 from garps_core.start.match_pose import REFINEMENT_STEPS
 from garps_core.start.ransac import ransac
 from garps_core.start.reprojection import MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
@@ -100,10 +101,8 @@ def pose_from_maps(maps: PairMaps, source: View, target: View, config: Config) -
     reason = "; ".join([f"{best} first: {pose.reason}", *failures])
     if contradiction > 1:
         reason += f"; the other order contradicts it, sigmas times {np.sqrt(contradiction):.1f}"
-    try:
+    with fixed_pose(f"{maps.origin}: {reason}"):
         return Prior(pose.T, covariance, maps.origin, reason)
-    except InputError as error:  # of points beyond all measure
-        raise InitialisationError(f"{maps.origin}: {reason}; {error}") from None
 
 
 def _orders(maps: PairMaps, source: View, target: View, min_confidence: float) -> dict[str, _Order]:
@@ -147,8 +146,11 @@ def _posed(order: _Order, by_network: bool, config: Config) -> _Pose:
     scale, scale_sigma, whose = _scale(order, T, by_network, config)
     T[:3, 3] *= scale
     fitted = replace(keep(way, fitting), points=way.points[fitting] * scale)
-    T, noise, shared = _refined(T, fitted, scale_sigma, config)
-    return _Pose(T, noise, shared, f"{count} of {len(way.points)} trusted pixels fit; {whose}")
+    counts = f"{count} of {len(way.points)} trusted pixels fit"
+    with fixed_pose(counts):
+        T, noise, shared = _refined(T, fitted, scale_sigma, config)
+        Prior(T, ros_from_twist(noise + shared, T))
+    return _Pose(T, noise, shared, f"{counts}; {whose}")
 
 
 def _second(order: _Order) -> OneWay:

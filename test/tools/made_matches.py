@@ -30,3 +30,9 @@ def exact_matches(seed=0, count=80, pixel_noise=0.0, outliers=0, relative_depth_
 
 def pose_from(matches, config=None):
     return pose_from_matches(matches, BLANK, BLANK, config or Config())
+
+
+def one_place(seed, copies=8, **noise):
+    """The same match many times over: any number of poses fits it."""
+    single = exact_matches(seed, count=1, **noise)
+    return Matches(*(np.repeat(part, copies, axis=0) for part in vars(single).values()))

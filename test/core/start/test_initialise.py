@@ -3,9 +3,10 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from made_matches import BLANK, exact_matches, pose_from
+from made_matches import BLANK, exact_matches, one_place, pose_from
 from surfaces import FREE, TRUTH, disturbed, room
 
 from garps_core import Config, Prior, Status, View, estimate_relative_pose
@@ -13,6 +14,7 @@ from garps_core.config.start import Start
 from garps_core.errors import InitialisationError
 from garps_core.geometry import inverted, project, se3_exp, se3_inverse, se3_log, transform, twist_from_ros
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
+from garps_core.start import initialise as initialise_module
 from garps_core.start.features import match_features
 from garps_core.start.initialise import combined, initialise
 from garps_core.start.reprojection import READINGS_AVERAGE
@@ -130,6 +132,46 @@ def test_matches_that_fit_no_pose_are_no_pose(name):
         pose_from(matches)
 
 
+@pytest.mark.parametrize("patch_sigma", [0.03, 0.3])
+def test_copies_of_one_match_are_no_pose(patch_sigma):
+    """Most of these normal equations are singular, or leave a covariance that is none."""
+    loose = Config().replace({"lifting.patch_sigma": patch_sigma, "start.ransac_px": 20.0})
+    refused = []
+    for seed in range(30):
+        try:
+            pose_from(one_place(seed, pixel_noise=0.5, relative_depth_noise=0.1), loose)
+        except InitialisationError as failure:
+            refused.append(str(failure))
+    assert sum("8 inliers, but they fix no pose" in text and "give a prior" in text for text in refused) > 10
+
+
+LOOSE = Config().replace({"lifting.patch_sigma": 0.03, "start.ransac_px": 20.0})
+"""Settings under which copies of one match pass as inliers of a pose."""
+
+
+def test_features_that_leave_the_pose_open_do_not_keep_a_prior_from_its_turn(monkeypatch):
+    for seed in range(10):
+        matches = one_place(seed, pixel_noise=0.5, relative_depth_noise=0.1)
+        monkeypatch.setattr(initialise_module, "match_features", lambda *_, found=matches: found)
+        assert initialise(BLANK, BLANK, LOOSE, disturbed())[0].origin == "given"
+        assert initialise(BLANK, BLANK, LOOSE)[0].origin == "identity"
+        for prior, origin in ((disturbed(), "given"), (None, "identity")):
+            assert estimate_relative_pose(BLANK, BLANK, LOOSE, prior).initial.origin == origin
+    with pytest.raises(InitialisationError):
+        initialise(BLANK, BLANK, LOOSE.replace({"start.method": "features"}), disturbed())
+
+
+def test_a_prior_stays_alone_where_features_are_too_uncertain_to_add_to_it():
+    """Covariances twenty orders of magnitude apart: their sum in float64 is one of them."""
+    given = a_prior(covariance=1e-6 * FREE)
+    rng = np.random.default_rng(0)
+    axes, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    vague = axes @ np.diag(10.0 ** np.arange(0, 18, 3)) @ axes.T
+    (start,) = combined(given, a_prior(covariance=0.5 * (vague + vague.T), origin="features"), 1e6)
+    assert start.origin == "given" and "too precise for the features" in start.reason
+    np.testing.assert_array_equal(start.covariance, given.covariance)
+
+
 def test_blank_images_start_at_identity_and_say_why():
     (start,) = initialise(BLANK, BLANK)
     assert start.origin == "identity" and start.reason.startswith("features failed: 0 feature matches")
@@ -187,9 +229,22 @@ def test_matches_carry_the_depth_of_their_pixels():
     assert np.median(np.abs(points[:, 2] / source.depth[row, column] - 1)) < 0.005
     error = np.linalg.norm(project(target.K, transform(truth, points)) - matches.target_px[trusted], axis=1)
     assert np.median(error) < 1.5
-    assert len(np.unique(matches.target_px, axis=0)) > 0.8 * len(matches), (
-        "mutual, but for features of two orientations"
-    )
+    assert len(np.unique(matches.target_px, axis=0)) > 0.95 * len(matches), "mutual"
+
+
+def test_two_places_are_two_matches_however_many_orientations_they_have():
+    """A disc looks alike from all sides, and SIFT describes it once per direction."""
+    wall = np.full((240, 320, 3), 128, np.uint8)
+    for x, radius in ((90, 5), (220, 8)):
+        cv2.circle(wall, (x, 120), radius, (20, 20, 20), -1, cv2.LINE_AA)
+    view = View(wall, BLANK.K, BLANK.depth)
+    matches = match_features(view, view, Start(match_ratio=1.0))
+    pairs = np.concatenate([matches.source_px, matches.target_px], axis=1)
+    assert len(pairs) and len(np.unique(pairs, axis=0)) == len(pairs)
+    source, target, _ = room(1, 1)
+    found = match_features(source, target, Start())
+    pairs = np.concatenate([found.source_px, found.target_px], axis=1)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
 
 
 def test_depth_on_a_silhouette_is_not_trusted():
