@@ -26,7 +26,8 @@ import torch
 from garps_core.checks import Float32Array
 from garps_core.depth_errors import error_fields
 from garps_core.edges import GRID_EDGE_RATIO, away_from_edges
-from garps_core.geometry import Array, adjoint, pixel_rays, se3_exp, se3_inverse, se3_log
+from garps_core.gauss_newton import NormalEquations, gauss_newton
+from garps_core.geometry import Array, adjoint, pixel_rays, se3_inverse, se3_log
 from garps_core.mixture import Frustum
 from garps_core.objective.visibility import SAME_SURFACE_RATIO, surface_at
 
@@ -122,7 +123,7 @@ def fit_brightness(
     precision, at = np.asarray(np.linalg.inv(covariance), np.float64), T
     for step in GRIDS:
         x, y = grid_of(source, step), grid_of(target, step)
-        at = climb_on(x, y, at, T, precision, 0.5 * measurements * step**2, STEPS)
+        at = step_on_grids(x, y, at, T, precision, 0.5 * measurements * step**2, STEPS)
     both = comparisons(x, y, at)
     if both is None:
         return None
@@ -137,16 +138,20 @@ def fit_brightness(
     return BrightnessFit(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(inverse @ precision))
 
 
-def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
-    """Take Gauss-Newton steps on one pair of grids from pose `at`, with a prior at T of the given precision (6, 6)."""
-    for _ in range(steps):
-        seen = comparisons(x, y, at)
-        if seen is None:
-            break
-        H, g = summed(*seen, at)
-        move = np.linalg.solve(weight * H + precision, weight * g - precision @ se3_log(at @ se3_inverse(T)))
-        at = np.asarray(se3_exp(np.asarray(move, np.float64)) @ at)
-    return at
+def step_on_grids(x: Grid, y: Grid, T: Array, prior: Array, precision: Array, weight: float, steps: int) -> Array:
+    """Take Gauss-Newton steps on one pair of grids from the pose T (4x4).
+
+    `prior` (4x4) with its precision (6, 6, left twist) holds the steps; `weight` multiplies the brightness term.
+    """
+
+    def linearise(T: Array) -> NormalEquations | None:
+        both = comparisons(x, y, T)
+        if both is None:
+            return None
+        H, score = summed(*both, T)
+        return weight * H + precision, precision @ se3_log(T @ se3_inverse(prior)) - weight * score
+
+    return gauss_newton(T, linearise, steps)
 
 
 def _only_compared(source: Frustum, target: Frustum, T: Array, covariance: Array) -> BrightnessFit | None:

@@ -13,16 +13,21 @@ bearings (`ransac.py`) is one more to begin with. Each match's depth is an unkno
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from garps_core.config import Config
+from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import error_sigmas
 from garps_core.errors import InitialisationError
-from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse
+from garps_core.gauss_newton import NormalEquations, gauss_newton
+from garps_core.geometry import Array, adjoint, ros_from_twist, se3_inverse
 from garps_core.start.degenerate import fixed_pose
 from garps_core.start.features import Matches
 from garps_core.start.ransac import pose_from_bearings, ransac
 from garps_core.start.reprojection import (
+    DAMPING,
     MIN_PIXEL_SIGMA,
     Normal,
     OneWay,
@@ -70,16 +75,11 @@ def _inverse(T: Array | None) -> Array | None:
 
 
 def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tuple[Array, Array]:
-    """Robust joint Gauss-Newton over both directions; pose and its covariance (ROS meaning)."""
-    sigma = 1.0
-    for _ in range(REFINEMENT_STEPS):
-        f, b, A = _both(T, forward, backward, sigma, config)
-        step = -np.linalg.solve(f.H + A.T @ b.H @ A + 1e-9 * np.eye(6), f.b + A.T @ b.b)
-        T = se3_exp(np.asarray(step, np.float64)) @ T
-        error = np.concatenate([f.residual_px.ravel(), b.residual_px.ravel()])
-        sigma = max(1.4826 * float(np.median(np.abs(error))), MIN_PIXEL_SIGMA)
-    f, b, A = _both(T, forward, backward, sigma, config)
-    H = f.H + A.T @ b.H @ A + 1e-9 * np.eye(6)
+    """Refine a pose by robust Gauss-Newton over both directions; return it and its covariance (ROS meaning)."""
+    joint = TwoWayReprojection(forward, backward, config.lifting)
+    T = gauss_newton(T, joint, REFINEMENT_STEPS)
+    f, b, A = joint.directions(T)
+    H = f.H + A.T @ b.H @ A + DAMPING
     # both directions use the same matches: their pixel noise is one noise, counted twice in H
     covariance = 2.0 * np.linalg.inv(H) * config.start.covariance_inflation**2
     for shared in (f.from_points + A.T @ b.from_pixels, f.from_pixels + A.T @ b.from_points):  # source, target
@@ -88,8 +88,26 @@ def _refine(T: Array, forward: OneWay, backward: OneWay, config: Config) -> tupl
     return T, ros_from_twist(np.asarray(covariance, np.float64), T)
 
 
-def _both(T: Array, forward: OneWay, backward: OneWay, sigma: float, config: Config) -> tuple[Normal, Normal, Array]:
-    inverse = se3_inverse(T)
-    f = normal_equations(forward, T, sigma, config.lifting)
-    b = normal_equations(backward, inverse, sigma, config.lifting)
-    return f, b, -adjoint(inverse)
+@dataclass
+class TwoWayReprojection:
+    """Normal equations of the reprojection errors of both directions, for `gauss_newton`."""
+
+    forward: OneWay
+    backward: OneWay
+    lifting: Lifting
+    pixel_sigma: float = 1.0
+    """Noise of the pixels, px, read off the residuals of the last pose."""
+
+    def __call__(self, T: Array) -> NormalEquations:
+        """Return H and g at the pose T (4x4), and update the noise of the pixels for the next one."""
+        f, b, A = self.directions(T)
+        error = np.concatenate([f.residual_px.ravel(), b.residual_px.ravel()])
+        self.pixel_sigma = max(1.4826 * float(np.median(np.abs(error))), MIN_PIXEL_SIGMA)
+        return f.H + A.T @ b.H @ A + DAMPING, f.b + A.T @ b.b
+
+    def directions(self, T: Array) -> tuple[Normal, Normal, Array]:
+        """Return the equations of each direction, and the map (6, 6) from the twist of T to that of its inverse."""
+        inverse = se3_inverse(T)
+        f = normal_equations(self.forward, T, self.pixel_sigma, self.lifting)
+        b = normal_equations(self.backward, inverse, self.pixel_sigma, self.lifting)
+        return f, b, -adjoint(inverse)

@@ -15,14 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from garps_core.config import Config
+from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import error_sigmas
 from garps_core.errors import InitialisationError
-from garps_core.geometry import Array, adjoint, ros_from_twist, se3_exp, se3_inverse, se3_log, transform
+from garps_core.gauss_newton import NormalEquations, gauss_newton
+from garps_core.geometry import Array, adjoint, ros_from_twist, se3_inverse, se3_log, transform
 from garps_core.point_maps import Bool, Framing, PairMaps, PointMap
 from garps_core.start.degenerate import fixed_pose
 from garps_core.start.match_pose import REFINEMENT_STEPS
 from garps_core.start.ransac import ransac
-from garps_core.start.reprojection import MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
+from garps_core.start.reprojection import DAMPING, MIN_PIXEL_SIGMA, Normal, OneWay, inliers_of, keep, normal_equations
 from garps_core.types import Prior, View
 
 STEP_PX = 4
@@ -201,21 +203,34 @@ def _depth_ratio(order: _Order, k: int, T: Array) -> float | None:
 
 def _refined(T: Array, way: OneWay, scale_sigma: float, config: Config) -> tuple[Array, Array, Array]:
     """Robust Gauss-Newton; the pose, and as covariances of its left twist the noise and what all points share."""
-    sigma, shared = 1.0, error_sigmas(config.lifting)
+    shared = error_sigmas(config.lifting)
     shared[0] = scale_sigma
     shared[1:6] = np.maximum(shared[1:6], config.start.network_warp_sigma)
     lifting = replace(config.lifting, patch_sigma=0.0)  # that of another depth: these points were seen with both views
-    for _ in range(REFINEMENT_STEPS):
-        normal = normal_equations(way, T, sigma, lifting)
-        step = -np.linalg.solve(normal.H + 1e-9 * np.eye(6), normal.b)
-        T = se3_exp(np.asarray(step, np.float64)) @ T
-        sigma = max(1.4826 * float(np.median(np.abs(normal.residual_px))), MIN_PIXEL_SIGMA)
-    normal = normal_equations(way, T, sigma, lifting)
-    inverse = np.linalg.inv(normal.H + 1e-9 * np.eye(6))
+    reprojection = OneWayReprojection(way, lifting)
+    T = gauss_newton(T, reprojection, REFINEMENT_STEPS)
+    normal = normal_equations(way, T, reprojection.pixel_sigma, lifting)
+    inverse = np.linalg.inv(normal.H + DAMPING)
     alike = max(1.0, float(np.trace(_spread(normal, way.px) @ inverse)) / 6)  # 1 for pixels that err by themselves
     effect = inverse @ normal.from_points * shared
     pointing = inverse @ normal.from_pixels * error_sigmas(config.lifting)
-    return np.asarray(T, np.float64), np.asarray(inverse * alike, np.float64), effect @ effect.T + pointing @ pointing.T
+    return T, np.asarray(inverse * alike, np.float64), effect @ effect.T + pointing @ pointing.T
+
+
+@dataclass
+class OneWayReprojection:
+    """Normal equations of the reprojection errors of one direction, for `gauss_newton`."""
+
+    way: OneWay
+    lifting: Lifting
+    pixel_sigma: float = 1.0
+    """Noise of the pixels, px, read off the residuals of the last pose."""
+
+    def __call__(self, T: Array) -> NormalEquations:
+        """Return H and g at the pose T (4x4), and update the noise of the pixels for the next one."""
+        normal = normal_equations(self.way, T, self.pixel_sigma, self.lifting)
+        self.pixel_sigma = max(1.4826 * float(np.median(np.abs(normal.residual_px))), MIN_PIXEL_SIGMA)
+        return normal.H + DAMPING, normal.b
 
 
 def _spread(normal: Normal, px: Array) -> Array:
@@ -230,7 +245,7 @@ def _spread(normal: Normal, px: Array) -> Array:
     scores, informations = np.zeros((count, 6)), np.zeros((count, 6, 6))
     np.add.at(scores, blocks, normal.scores)
     np.add.at(informations, blocks, normal.informations)
-    hidden = informations @ np.linalg.inv(normal.H + 1e-9 * np.eye(6))
+    hidden = informations @ np.linalg.inv(normal.H + DAMPING)
     g = np.linalg.solve(np.eye(6) - hidden, scores[..., None])[..., 0]
     return np.asarray(g.T @ g * ((count - 1) / count))
 

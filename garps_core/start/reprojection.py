@@ -22,6 +22,8 @@ from garps_core.config.lifting import Lifting
 from garps_core.depth_errors import depth_sigma, error_fields
 from garps_core.geometry import Array, point_jacobian, project, transform
 
+DAMPING = 1e-9 * np.eye(6)
+"""Added to a Hessian, so that an open direction is not singular."""
 MIN_PIXEL_SIGMA = 0.3
 """px; no residuals, however small, make a match more precise than features are."""
 HUBER = 2.0
