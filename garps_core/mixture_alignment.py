@@ -55,13 +55,13 @@ def _preference(estimate: PoseEstimate) -> tuple[bool, bool, float]:
     return estimate.ok, estimate.T_target_source is not None, estimate.quality
 
 
-def align_mixtures(source: Mixture, target: Mixture, start: Prior, config: Config | None = None) -> PoseEstimate:
+def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Config | None = None) -> PoseEstimate:
     """Align two mixtures from a start pose, which counts as a measurement with its covariance.
 
     Args:
         source, target: mixtures, each in its own camera's frame. A frustum, when present, is used to leave out what
             the other camera cannot see.
-        start: T_target_source and covariance to start from.
+        initial: the start pose, T_target_source and its covariance.
         config: `config.alignment`, `device` and `dtype` are used; the default preset when None.
     Returns:
         PoseEstimate; `objective` is the mean of the two-way "log" objective, or the paper's log f.
@@ -75,7 +75,7 @@ def align_mixtures(source: Mixture, target: Mixture, start: Prior, config: Confi
             raise InputError(
                 f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
             )
-    estimate = _aligned(source, target, start, config)
+    estimate = _aligned(source, target, initial, config)
     estimate.seconds["align"] = time.perf_counter() - begin
     return estimate
 

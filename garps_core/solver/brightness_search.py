@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from garps_core.geometry import Array
 from garps_core.mixture import Frustum
-from garps_core.objective.brightness import Grid, step_on_grids, comparisons, grid_of
+from garps_core.objective.brightness import Grid, comparisons, grid_of, step_on_grids
 from garps_core.objective.state import WeightedStart
 
 WIDTH_PX = 40
