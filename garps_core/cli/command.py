@@ -109,7 +109,7 @@ def align(
         str | None, typer.Option(help=f"{', '.join(PRESETS)}. [default; without depth monocular]")
     ] = None,
     reconstruction: Annotated[str | None, typer.Option(help=f"{', '.join(methods())}. [auto]")] = None,
-    start: Annotated[str | None, typer.Option(help=f"Initial pose: {', '.join(STARTS)}. [auto]")] = None,
+    start: Annotated[str | None, typer.Option(help=f"Starting pose: {', '.join(STARTS)}. [auto]")] = None,
     set_: Changes = None,
     settings: Settings = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,

@@ -122,7 +122,7 @@ def fit_brightness(
     precision, at = np.asarray(np.linalg.inv(covariance), np.float64), T
     for step in GRIDS:
         x, y = grid_of(source, step), grid_of(target, step)
-        at = climb_on(x, y, at, T, precision, 0.5 * measurements * step**2, STEPS)
+        at = ascend_on(x, y, at, T, precision, 0.5 * measurements * step**2, STEPS)
     both = comparisons(x, y, at)
     if both is None:
         return None
@@ -137,7 +137,7 @@ def fit_brightness(
     return BrightnessFit(at, np.asarray(0.5 * (spread + spread.T)), *agreement, kept=np.asarray(inverse @ precision))
 
 
-def climb_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
+def ascend_on(x: Grid, y: Grid, at: Array, T: Array, precision: Array, weight: float, steps: int) -> Array:
     """Take Gauss-Newton steps on one pair of grids from pose `at`, with a prior at T of the given precision (6, 6)."""
     for _ in range(steps):
         seen = comparisons(x, y, at)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from garps_core.geometry import Array
 from garps_core.mixture import Frustum
-from garps_core.objective.brightness import Grid, climb_on, comparisons, grid_of
+from garps_core.objective.brightness import Grid, ascend_on, comparisons, grid_of
 from garps_core.objective.state import WeightedStart
 
 WIDTH_PX = 40
@@ -38,7 +38,7 @@ def search_by_brightness(
     x, y = (grid_of(view, max(1, round(view.depth.shape[1] / WIDTH_PX))) for view in (source, target))
     ends = starting_poses
     for steps in (FIRST_STEPS, MORE_STEPS):
-        moved = [climb_on(x, y, at, start.T, start.precision, POINT_WEIGHT, steps) for at in ends]
+        moved = [ascend_on(x, y, at, start.T, start.precision, POINT_WEIGHT, steps) for at in ends]
         ends = [at for merit, at in sorted(((_agreement(x, y, at), at) for at in moved), key=_first) if merit > 0]
         ends = ends[:CONTINUED]
     return ends
