@@ -50,7 +50,7 @@ def _installed(path: tuple[str, ...]) -> dict[str, EntryPoint]:
 
 @dataclass(frozen=True)
 class Reconstruction(Checked):
-    """The way that `reconstruct` turns a view into a mixture, and the weights it uses (docs/weights.md)."""
+    """Settings by which `reconstruct` turns a view into a mixture, and the weights it uses (docs/weights.md)."""
 
     method: str = setting(
         "auto",

@@ -15,7 +15,7 @@ STARTS = ("auto", "features", "identity", *TWO_VIEW)
 
 @dataclass(frozen=True)
 class Start(Checked):
-    """The way that `initialise` finds the start pose."""
+    """Settings by which `initialise` finds the start pose."""
 
     method: str = setting(
         "auto",
