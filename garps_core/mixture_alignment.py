@@ -22,7 +22,7 @@ from garps_core.objective.state import WeightedStart
 from garps_core.solver.ladder import MIN_ROWS, Solution
 from garps_core.solver.methods import METHODS
 from garps_core.solver.problem import Problem
-from garps_core.start.initialise import identity
+from garps_core.start.identity_start import identity
 from garps_core.types import Mixture, PoseEstimate, Prior, Status
 from garps_core.verdict.candidate import Candidate, best_candidate
 from garps_core.verdict.covariance import inflated, pose_covariance, share_of_start

@@ -6,8 +6,10 @@ A distribution adds one with `NAME = "package.module:object"` in its entry point
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -20,6 +22,30 @@ def installed(group: str) -> dict[str, EntryPoint]:
     for point in entry_points(group=group):
         found.setdefault(point.name, point)
     return dict(sorted(found.items()))
+
+
+def installed_besides(group: str, taken: frozenset[str]) -> dict[str, EntryPoint]:
+    """Return the entry points of a group by name, without the names that mean something else already.
+
+    They are kept for this `sys.path`; settings are made too often to look there every time.
+    """
+    return _installed_besides(group, taken, tuple(sys.path))
+
+
+@lru_cache(maxsize=8)
+def _installed_besides(group: str, taken: frozenset[str], path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    return {name: point for name, point in installed(group).items() if name not in taken}
+
+
+def told(point: EntryPoint) -> str:
+    """Return the name of an entry point with its origin, for errors: "'name' (module:object of distribution 1.0)"."""
+    of = f" of {point.dist.name} {point.dist.version}" if point.dist else ""
+    return f"{point.name!r} ({point.value}{of})"
+
+
+def origin(point: EntryPoint | None) -> str:
+    """Return the distribution of an entry point, for lists; "" where it is not known."""
+    return f"installed by {point.dist.name} {point.dist.version}" if point and point.dist else ""
 
 
 def load(group: str, name: str, what: str, page: str = "docs/extending.md") -> Any:

@@ -18,7 +18,7 @@ from bench.rows.row import ERRORS, START, Row
 from bench.rows.variants import GARPS, GARPS_NO_FEATURES, VARIANTS, Variant, variant_estimate
 from garps_core import Config, GarpsError, PoseEstimate, Prior, Status, estimate_relative_pose, metrics
 from garps_core.checks import Float64Array
-from garps_core.start.initialise import identity
+from garps_core.start.identity_start import identity
 
 STARTS = ("features", "disturbed", "identity", "none")
 """GARPS' own features + PnP; the truth off by 1 deg and 0.12 m, given as a prior; identity; or GARPS starts as it sees

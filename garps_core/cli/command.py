@@ -19,16 +19,16 @@ from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.cli.image_files import read_image, read_view
 from garps_core.cli.report import as_json, as_text
 from garps_core.cli.weights import app as weights_app
-from garps_core.config import PRESETS, Config, Reconstruction, methods
+from garps_core.config import PRESETS, Config, Reconstruction, methods, start_methods
 from garps_core.config.combinations import check_settings
-from garps_core.config.start import STARTS, TWO_VIEW
+from garps_core.config.start import TWO_VIEW
 from garps_core.config.text import configured
 from garps_core.devices import checked_device
 from garps_core.errors import GarpsError, InitialisationError, InputError, ModelError, WeightsError
 from garps_core.mixtures.splat_reader import read_splats
 from garps_core.models.depth_networks import preset_for
 from garps_core.point_maps import PairMaps
-from garps_core.start.initialise import identity
+from garps_core.start.identity_start import identity
 from garps_core.start.intrinsics import intrinsics_of
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
 
@@ -111,7 +111,7 @@ def align(
         str | None, typer.Option(help=f"{', '.join(PRESETS)}. [default; without depth monocular]")
     ] = None,
     reconstruction: Annotated[str | None, typer.Option(help=f"{', '.join(methods())}. [auto]")] = None,
-    start: Annotated[str | None, typer.Option(help=f"Start pose: {', '.join(STARTS)}. [auto]")] = None,
+    start: Annotated[str | None, typer.Option(help=f"Start pose: {', '.join(start_methods())}. [auto]")] = None,
     set_: Changes = None,
     settings: Settings = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:0 ... [cpu]")] = None,

@@ -15,7 +15,8 @@ import torch
 from garps_core.align import align_mixtures
 from garps_core.checks import Float64Array
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, transform
-from garps_core.models.depth_networks import listed
+from garps_core.models import depth_networks
+from garps_core.start import methods
 from garps_core.types import Mixture, Prior
 from garps_core.weights.manifest import ALL
 from garps_core.weights.store import installed, weights_folder
@@ -41,7 +42,8 @@ def examine() -> tuple[list[tuple[str, str]], bool]:
         rows.append((name, version_of(name) if found else f"not installed ({purpose})"))
     rows += [
         ("weights", weights()),
-        *listed(),
+        *depth_networks.listed(),
+        *((f"start {name}", text) for name, text in methods.listed()),
         ("devices", devices()),
         ("threads", f"{torch.get_num_threads()} of {os.cpu_count()}"),
         ("memory", memory()),

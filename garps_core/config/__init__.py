@@ -7,12 +7,11 @@ from garps_core.config.ladders import Rung
 from garps_core.config.lifting import Lifting
 from garps_core.config.paper import Paper
 from garps_core.config.reconstruction import SCENES, Reconstruction, depth_networks, methods
-from garps_core.config.start import STARTS, TWO_VIEW, Start
+from garps_core.config.start import TWO_VIEW, Start, start_methods
 
 __all__ = [
     "PRESETS",
     "SCENES",
-    "STARTS",
     "TWO_VIEW",
     "Alignment",
     "Config",
@@ -23,4 +22,5 @@ __all__ = [
     "Start",
     "depth_networks",
     "methods",
+    "start_methods",
 ]

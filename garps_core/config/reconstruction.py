@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib.metadata import EntryPoint
 
 from garps_core import plugins
@@ -38,14 +36,7 @@ def installed_depth_networks() -> dict[str, EntryPoint]:
 
     None can take a name that means something else already.
     """
-    return _installed(tuple(sys.path))
-
-
-@lru_cache(maxsize=4)
-def _installed(path: tuple[str, ...]) -> dict[str, EntryPoint]:
-    """`installed_depth_networks` for this `sys.path`; settings are made too often to look there every time."""
-    taken = {*_BEFORE, *DEPTH_NETWORKS, *_AFTER}
-    return {name: point for name, point in plugins.installed(DEPTH_PLUGINS).items() if name not in taken}
+    return plugins.installed_besides(DEPTH_PLUGINS, frozenset((*_BEFORE, *DEPTH_NETWORKS, *_AFTER)))
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 
+from garps_core import plugins
 from garps_core.config.field import Checked, setting
 
 TWO_VIEW = ("mast3r", "dust3r", "adapter")
 """Starts by a two-view network."""
-STARTS = ("auto", "features", "identity", *TWO_VIEW)
-"""Ways to a start pose."""
+STARTS = {
+    "features": "garps_core.start.feature_start:find",
+    "identity": "garps_core.start.identity_start:find",
+    **dict.fromkeys(TWO_VIEW, "garps_core.start.network_start:find"),
+}
+"""Ways to start of this package by name, each with its function as "module:function" (`garps_core.start.methods`)."""
+START_PLUGINS = "garps_core.start"
+"""Entry point group of the ways to start that other distributions add (docs/extending.md)."""
+
+
+def start_methods() -> tuple[str, ...]:
+    """Return the values of `start.method`: auto, the ways to start of this package, then the installed ones."""
+    return "auto", *STARTS, *installed_starts()
+
+
+def installed_starts() -> dict[str, EntryPoint]:
+    """Return the entry points of the ways to start that other distributions add, by name. Nothing is imported.
+
+    None can take a name that means something else already; "given" is the origin of a prior.
+    """
+    return plugins.installed_besides(START_PLUGINS, frozenset(("auto", "given", *STARTS)))
 
 
 @dataclass(frozen=True)
@@ -21,7 +42,7 @@ class Start(Checked):
         "auto",
         "source of the start pose: auto = the given prior and features together, or the one there is, else identity if "
         "`start.identity_fallback`; features; identity; mast3r, dust3r, adapter = a two-view network, and the prior",
-        choices=STARTS,
+        choices=start_methods,
         live=False,
     )
     weights: str = setting(

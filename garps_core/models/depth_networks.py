@@ -17,7 +17,7 @@ from garps_core.checks import Float32Array
 from garps_core.config import Config, Reconstruction, depth_networks
 from garps_core.config.reconstruction import DEPTH_NETWORKS, DEPTH_PLUGINS, installed_depth_networks
 from garps_core.errors import ConfigError, GarpsError, ModelError
-from garps_core.plugins import foreign
+from garps_core.plugins import foreign, origin, told
 from garps_core.types import View
 from garps_core.weights.store import default
 
@@ -104,9 +104,9 @@ def metric_depths(name: str, loaded: Any, views: Sequence[View], settings: Recon
 def _check(name: str, view: View, depth: Any) -> None:
     expected = view.rgb.shape[:2]
     if not isinstance(depth, np.ndarray) or depth.shape != expected or depth.dtype != np.float32:
-        told = f"{depth.dtype} {depth.shape}" if isinstance(depth, np.ndarray) else type(depth).__name__
+        given = f"{depth.dtype} {depth.shape}" if isinstance(depth, np.ndarray) else type(depth).__name__
         raise ModelError(
-            f"the depth network {_told(name)} returned {told}: expected an array float32 {expected}, metres"
+            f"the depth network {_told(name)} returned {given}: expected an array float32 {expected}, metres"
         )
     if not np.isfinite(depth).all():
         raise ModelError(f"the depth of the depth network {_told(name)} is not finite: expected metres, 0 = unknown")
@@ -115,9 +115,7 @@ def _check(name: str, view: View, depth: Any) -> None:
 def _told(name: str) -> str:
     """The name, and where it comes from if not from this package."""
     point = installed_depth_networks().get(name)
-    if point is None:
-        return name
-    return f"{name!r} ({point.value}{f' of {point.dist.name} {point.dist.version}' if point.dist else ''})"
+    return name if point is None else told(point)
 
 
 def listed() -> list[tuple[str, str]]:
@@ -130,9 +128,8 @@ def _described(name: str) -> str:
         network = depth_network(name)
     except GarpsError as error:
         return str(error)
-    point = installed_depth_networks().get(name)
-    origin = f"installed by {point.dist.name} {point.dist.version}" if point and point.dist else ""
-    return "; ".join(text for text in (network.description, network.warning, origin) if text)
+    by = origin(installed_depth_networks().get(name))
+    return "; ".join(text for text in (network.description, network.warning, by) if text)
 
 
 def preset_for(method: str, with_depth: bool) -> str:

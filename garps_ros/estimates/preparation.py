@@ -14,12 +14,13 @@ from garps_core.align import Estimator
 from garps_core.config import Config, Reconstruction, depth_networks
 from garps_core.config.combinations import check_settings, check_start
 from garps_core.config.lifting import Lifting
-from garps_core.config.start import TWO_VIEW, Start
+from garps_core.config.start import TWO_VIEW, Start, installed_starts
 from garps_core.errors import ConfigError
 from garps_core.mixtures.reconstruct import with_depth
 from garps_core.models.depth_networks import with_weights
 from garps_core.models.in_use import Networks
 from garps_core.objective import compiled
+from garps_core.start.methods import start_method
 from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
@@ -95,8 +96,11 @@ def load_networks(config: Config, say: Callable[[str], None], networks: Networks
 
     Raises:
         WeightsError: weights that are not installed, or not what they should be.
-        ModelError: a network that does not fit the memory. ConfigError: the device is not there.
+        ModelError: a network that does not fit the memory.
+        ConfigError: the device is not there, or an installed way to start cannot be imported.
     """
+    if config.start.method in installed_starts():
+        start_method(config.start.method)  # a mistake ends the node now, not with the first pair
     settings, begin, names = config.reconstruction, time.perf_counter(), []
     two_view = config.start.method in TWO_VIEW
     if needs_depth(config) and settings.semantics == "none" and not two_view:

@@ -215,7 +215,7 @@ class JobRunner:
         method = self._job.config.start.method
         if found.initial is None:
             return f"not used: {found.status.value}"
-        if found.initial.origin.startswith("given"):
+        if found.initial.origin.split(" and ")[0] == "given":
             return "used"
         if method in ("features", "identity"):
             return f"not used: start.method is {method}"

@@ -12,7 +12,7 @@ from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.solver import search
 from garps_core.solver.brightness_search import CONTINUED, search_by_brightness
-from garps_core.start.initialise import identity
+from garps_core.start.identity_start import identity
 
 START = weighted_start(identity(Config(), ""), Config())
 AROUND = search.starting_poses(START, search.FINE_RINGS)

@@ -15,7 +15,7 @@ from garps_core.mixture_alignment import weighted_start
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.objective.state import WeightedStart
 from garps_core.solver import ladder, methods, search
-from garps_core.start.initialise import identity
+from garps_core.start.identity_start import identity
 
 FROM_IDENTITY = Config().replace({"start.method": "identity"})
 LADDER_ONLY = FROM_IDENTITY.replace({"alignment.guess_uncertainty": 1e6})

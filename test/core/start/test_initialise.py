@@ -14,7 +14,7 @@ from garps_core.config.start import Start
 from garps_core.errors import InitialisationError
 from garps_core.geometry import inverted, project, se3_exp, se3_inverse, se3_log, transform, twist_from_ros
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
-from garps_core.start import initialise as initialise_module
+from garps_core.start import feature_start
 from garps_core.start.features import Matches, match_features
 from garps_core.start.initialise import combined, initialise
 from garps_core.start.reprojection import READINGS_AVERAGE
@@ -152,7 +152,7 @@ LOOSE = Config().replace({"lifting.patch_sigma": 0.03, "start.ransac_px": 20.0})
 def test_features_that_leave_the_pose_open_do_not_keep_a_prior_from_its_turn(monkeypatch):
     for seed in range(10):
         matches = one_place(seed, pixel_noise=0.5, relative_depth_noise=0.1)
-        monkeypatch.setattr(initialise_module, "match_features", lambda *_, found=matches: found)
+        monkeypatch.setattr(feature_start, "match_features", lambda *_, found=matches: found)
         assert initialise(BLANK, BLANK, LOOSE, disturbed())[0].origin == "given"
         assert initialise(BLANK, BLANK, LOOSE)[0].origin == "identity"
         for prior, origin in ((disturbed(), "given"), (None, "identity")):
