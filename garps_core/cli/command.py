@@ -90,8 +90,7 @@ def align(
     target: Annotated[Path, typer.Argument(help="Image of the target camera, or splats (.ply).", metavar="TGT")],
     K: Annotated[Four | None, typer.Option("--K", help="Intrinsics of images, px.", metavar="FX FY CX CY")] = None,
     K_target: Annotated[
-        Four | None,
-        typer.Option("--K-target", help="Intrinsics of the target, px.", metavar="FX FY CX CY"),
+        Four | None, typer.Option("--K-target", help="Intrinsics of TGT, px.", metavar="FX FY CX CY")
     ] = None,
     depth_source: Annotated[
         Path | None, typer.Option(help="Depth registered to SRC: 16-bit PNG (mm), .npy or float TIFF (m).")
@@ -101,8 +100,7 @@ def align(
         float | None, typer.Option(help="Metres per unit of the depth files. [integers 0.001, floats 1]")
     ] = None,
     prior: Annotated[
-        str | None,
-        typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"'),
+        str | None, typer.Option(help="Pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"')
     ] = None,
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
