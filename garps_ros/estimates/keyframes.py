@@ -100,7 +100,7 @@ class KeyframeTracker:
         if self._keyframe is None and share < self.rule.min_depth_share:
             raise ReconstructionError(
                 f"the view has depth at {share:.1%} of its pixels: expected at least {self.rule.min_depth_share:.0%} "
-                "to begin a trajectory; uncover the camera, or check the depth topic"
+                "to begin a trajectory. Uncover the camera, or check the depth topic"
             )
         # A covered lens may be uncovered by now: after a blank view the keyframe gets one more try.
         patience = self.rule.lost_after + self._was_blank

@@ -129,8 +129,8 @@ class Input:
         if not others or len(others) < len(offers):
             return ""
         return (
-            f"{others[0].node_name} publishes {others[0].topic_type}, expected {wanted}; "
-            "check the remapping, image_transport and depth_transport"
+            f"{others[0].node_name} publishes {others[0].topic_type}, expected {wanted}. "
+            "Check the remapping, image_transport and depth_transport"
         )
 
 

@@ -101,7 +101,7 @@ def _node() -> Iterator[Node]:
     except RuntimeError as error:  # what rcl's errors are
         context.try_shutdown()
         raise BagError(
-            f"ROS 2 does not start: {' '.join(str(error).split())}; see ROS_DOMAIN_ID and its like"
+            f"ROS 2 does not start: {' '.join(str(error).split())}. See ROS_DOMAIN_ID and its like"
         ) from None
     try:
         yield node
