@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera followed against keyframes: when to take a new one, and how poses and covariances add up."""
+"""Keyframe tracking of one camera: the rule for new keyframes, and the chaining of poses and covariances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from garps_ros.parameters.settings import NodeSettings
 Estimate = Callable[[View, View], PoseEstimate]
 """A function (source, target) -> pose of the source camera in the target camera."""
 MIN_DEPTH_SHARE = 0.02
-"""Share of pixels with depth below which a view begins no segment; it tells a covered lens from a sparse sensor."""
+"""Smallest share of pixels with depth for a view to begin a segment; a covered lens has less than a sparse sensor."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ Type = rclpy.parameter.Parameter.Type
 TYPES = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}
 OUR_PREFIXES = tuple(f"{part}." for part in PARTS)
 ALIKE = 0.83
-"""Names at least this similar to one of ours are taken for a typo; `max_range` (0.82) is not."""
+"""Smallest similarity (0..1) to a parameter's name that counts as a typo; `max_range` has 0.82."""
 
 
 class NodeParameters:
@@ -79,7 +79,7 @@ class NodeParameters:
         return {change.name: change.value for change in changes if change.name in self._values}
 
     def _judge(self, changes: list[rclpy.parameter.Parameter]) -> SetParametersResult:
-        """Check the settings as they would be; changes nothing. The reason of a refusal reaches whoever asked."""
+        """Check the settings as they would be; changes nothing. The caller receives the reason of a refusal."""
         ours = self._ours(changes)
         try:
             if ours:
