@@ -60,7 +60,7 @@ INDEFINITE = changed(np.eye(6), (0, 1), 2) + changed(np.zeros((6, 6)), (1, 0), 2
 VIEWS = {
     "rgb list": (lambda: view(rgb=[[0, 0, 0]]), "rgb is list: expected an HxWx3 uint8 array"),
     "rgb float": (lambda: view(rgb=RGB / 255), "rgb is dtype float64: expected an HxWx3 uint8 array, values 0..255"),
-    "rgb grey": (lambda: view(rgb=RGB[..., 0]), r"shape \(48, 64\): expected HxWx3; repeat a grey image over three"),
+    "rgb grey": (lambda: view(rgb=RGB[..., 0]), r"shape \(48, 64\): expected HxWx3. Repeat a grey image over three"),
     "rgb with alpha": (lambda: view(rgb=np.zeros((48, 64, 4), np.uint8)), r"shape \(48, 64, 4\): expected HxWx3"),
     "rgb planes first": (lambda: view(rgb=np.zeros((3, 48, 64), np.uint8)), r"shape \(3, 48, 64\): expected HxWx3"),
     "rgb tiny": (lambda: view(rgb=RGB[:15]), "rgb is 64x15: expected at least 16x16"),
@@ -76,7 +76,7 @@ VIEWS = {
     "K infinite": (lambda: view(K=changed(K, (0, 0), np.inf)), "K holds NaN or infinity: expected finite"),
     "K zeros": (lambda: view(K=np.zeros((3, 3))), "fx=0, fy=0: expected both positive, .* calibrate it first"),
     "K negative focal": (lambda: view(K=changed(K, (1, 1), -50)), "fx=50, fy=-50: expected both positive"),
-    "K transposed": (lambda: view(K=K.T), r"last row \[32.0, 24.0, 1.0\]: expected \[0, 0, 1\].* is it transposed"),
+    "K transposed": (lambda: view(K=K.T), r"last row \[32.0, 24.0, 1.0\]: expected \[0, 0, 1\].* Is it transposed"),
     "K skew": (lambda: view(K=changed(K, (0, 1), 0.5)), "K has skew 0.5: expected 0; rectify the image first"),
     "K scaled": (lambda: view(K=2 * K), r"last row \[0.0, 0.0, 2.0\]: expected \[0, 0, 1\]"),
     "depth uint16": (
@@ -117,7 +117,7 @@ PRIORS = {
         "not symmetric: largest difference 0.5, expected 0",
     ),
     "covariance NaN": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.nan)), "NaN or infinity: expected finite var"),
-    "covariance infinite": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.inf)), "use a large one for unknown"),
+    "covariance infinite": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.inf)), "Use a large one for unknown"),
 }
 
 MIXTURES = {
