@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Differences of two runs of `bench.run` on the pairs that both hold, by method; a repeated run has none.
 
+Run the benchmark again, then compare:
+
     python -m bench.run --limit 5 --out out/again
     python -m bench.repeat out/run out/again
 """

@@ -179,7 +179,7 @@ def _of_splats(
     if of_images or asked or config.reconstruction.method not in ("auto", "ply"):
         raise InputError(
             "splat files come with --K, depth files or settings of reconstruction: expected none, nothing is to be "
-            "reconstructed; leave them out"
+            "reconstructed. Leave them out"
         )
 
     x, y = (read_splats(file) for file in files)
