@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a two-view network says of a pair: for every pixel of both pictures the point it sees, in one camera's frame.
+"""Point maps of a pair by a two-view network: a 3D point for every pixel of both pictures, in one camera's frame.
 
-Any network of this family fits in here: MASt3R and DUSt3R do, and so would a newer one (`docs/two_view_models.md`).
+MASt3R and DUSt3R give them, and a newer network of this family fits in (`docs/two_view_models.md`).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class PointMap:
 
     Args:
         points: hxwx3 float32, x right, y down, z forward in the frame of the order's first camera; metres if the
-            network is metric; NaN where it does not know.
-        confidence: hxw float32; the larger, the surer, on the network's own scale.
-        descriptors: hxwxC float32 unit vectors that are alike where two pixels see the same, or None.
+            network is metric; NaN = unknown.
+        confidence: hxw float32, on the network's own scale; larger is surer.
+        descriptors: hxwxC float32 unit vectors that are similar where two pixels see the same point, or None.
     Raises:
-        ModelError: other shapes or types, or a confidence that is not finite.
+        ModelError: wrong shapes or types, or a confidence that is not finite.
     """
 
     points: Float32Array
@@ -55,7 +55,7 @@ class PointMap:
 
 @dataclass(frozen=True)
 class Framing:
-    """Which part of an image a network sees, and how large.
+    """The part of an image that a network sees, and its size there.
 
     With coordinates counted from the corner of the first pixel: seen = image * scale - offset.
 
@@ -110,20 +110,20 @@ class PairMaps:
                 raise ModelError(f"{self.origin} gives point maps of {found} pixels: expected {sizes}, its framings'")
 
     def trusted(self, least: float) -> tuple[Bool, Bool]:
-        """Pixels of source and target of which either of the picture's two maps is surer than `least`."""
+        """Masks (h, w) of source and target: the confidence of either of a picture's two maps is above `least`."""
         of_source = np.maximum(self.source_first[0].confidence, self.target_first[1].confidence) > least
         of_target = np.maximum(self.target_first[0].confidence, self.source_first[1].confidence) > least
         return of_source, of_target
 
     def gives_metres(self, scale: str) -> bool:
-        """Whether `start.scale` asks for the network's own metres. Raises ConfigError where it has none."""
+        """Whether `start.scale` asks for the network's own metres. Raises ConfigError if the network is not metric."""
         if scale == "network" and not self.metric:
             raise ConfigError(f"start.scale is network, and {self.origin} has no metres: expected auto or depth")
         return self.metric and scale != "depth"
 
 
 class TwoViewModel(Protocol):
-    """What a two-view network has to be able to do; see `PairMaps`."""
+    """Interface of a two-view network; see `PairMaps`."""
 
     def __call__(self, source: Picture, target: Picture) -> PairMaps:
         """Point maps of two pictures HxWx3 uint8 RGB, of any sizes, in both orders.
@@ -134,9 +134,9 @@ class TwoViewModel(Protocol):
 
 
 def own_depth(maps: PairMaps, source: View, target: View, min_confidence: float) -> tuple[Float32Array, Float32Array]:
-    """Depth of both views by the maps in their own frames, HxW float32, NaN outside what the network saw and trusted.
+    """Depth of both views from the maps in their own frames, HxW float32, in metres only if `maps.metric`.
 
-    Metres only where `maps.metric`.
+    NaN outside of the framing, and where neither confidence is above `min_confidence`.
     """
     first = (maps.source_first[0], maps.target_first[0])
     of_source, of_target = map(_own_depth, (source, target), first, maps.trusted(min_confidence), maps.framings)

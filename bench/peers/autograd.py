@@ -30,7 +30,7 @@ class PlainObjective:
         return len(self.weights)
 
     def value(self, q: Tensor, t: Tensor) -> Tensor:
-        """f at the quaternion q (w, x, y, z), any length, and the translation t, m; differentiable."""
+        """Objective f at the quaternion q (w, x, y, z), any length, and the translation t, m; differentiable."""
         R = rotation(q)
         d = self.means @ R.T + t - self.partner_means
         S = R @ self.covariances @ R.T + self.partner_covariances

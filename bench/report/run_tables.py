@@ -112,7 +112,7 @@ def markdown(rows: Sequence[Row], facts: Row) -> str:
 
 
 def write(out: Path, rows: Sequence[Row], facts: Row, end: str = "") -> None:
-    """rows.csv, run.json (rows, facts) and table.md, which closes with `end`, into a folder."""
+    """Write rows.csv, run.json (rows, facts) and table.md, which closes with `end`, into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (out / "rows.csv").open("w", newline="") as file:

@@ -51,7 +51,7 @@ class Part:
         return self.transformed(R, shift)
 
     def transformed(self, R: Array, shift: Sequence[float]) -> Part:
-        """x -> R x + shift."""
+        """Rigid motion x -> R x + shift."""
         return replace(self, corners=self.corners @ R.T + np.asarray(shift, float), normals=self.normals @ R.T)
 
 

@@ -119,7 +119,7 @@ def reusable_rows(path: Path, seed: int) -> dict[Key, dict[str, Row]]:
 
 
 def _with_infinities(row: Row) -> Row:
-    """run.json holds None for infinity."""
+    """The row with infinity in place of None, by which run.json stands for it."""
     return {name: float("inf") if name in ERRORS and value is None else value for name, value in row.items()}
 
 

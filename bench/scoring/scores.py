@@ -27,7 +27,7 @@ VCRE_PX = 90.0
 
 
 def pose_error_deg(row: Mapping[str, Any]) -> float:
-    """max(E_rot, E_dir) of a row, deg; 0..180, or infinity for a failure.
+    """Pose error max(E_rot, E_dir) of a row, deg; 0..180, or infinity for a failure.
 
     Where the true translation is zero it has no direction and E_rot counts alone; an estimate of zero where the true
     one is not names no direction and is a failure. The sign of a translation counts: 180 deg is opposite, not right.
@@ -68,7 +68,9 @@ def auc(errors_deg: npt.ArrayLike, thresholds: Sequence[float] = THRESHOLDS_DEG)
 
 
 def mean_average_accuracy(errors_deg: npt.ArrayLike, limit_deg: int = 30) -> float:
-    """mAA(limit): mean over k = 1..limit of the share of errors below k deg, 0..1. NaN without errors.
+    """Mean average accuracy, mAA(limit): mean over k = 1..limit of the share of errors below k deg, 0..1.
+
+    NaN without errors.
 
     Often called AUC@30, but not the number that `auc` gives: recall is read at whole degrees. As in the code it is
     from, an error of just k deg counts from k + 1 deg on, one of just the limit at the limit.

@@ -70,7 +70,7 @@ def facts() -> Row:
 
 
 def write(out: Path, sections: dict[str, Section], told: Row) -> None:
-    """run.json (everything) and table.md (for a document) into a folder."""
+    """Write run.json (everything) and table.md (for a document) into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     held = {"facts": told, "sections": {name: section.as_json() for name, section in sections.items()}}
     (out / "run.json").write_text(json.dumps(held, indent=1))

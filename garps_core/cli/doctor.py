@@ -69,7 +69,7 @@ def weights() -> str:
 
 
 def devices() -> str:
-    """cpu, and every CUDA device with its memory."""
+    """The CPU, and every CUDA device with its memory."""
     found = ["cpu"]
     if torch.cuda.is_available():
         for i in range(torch.cuda.device_count()):

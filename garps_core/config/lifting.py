@@ -10,7 +10,7 @@ from garps_core.config.field import Checked, setting
 
 @dataclass(frozen=True)
 class Lifting(Checked):
-    """The sensor model, by which `reconstruct` makes a Gaussian of a pixel with depth."""
+    """Settings by which `reconstruct` makes a Gaussian of a pixel with depth."""
 
     stride: int = setting(
         2, "every n-th pixel is used, in both directions of the image; 1 = all", unit="px", low=1, high=32

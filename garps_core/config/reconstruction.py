@@ -41,7 +41,7 @@ def installed_depth_networks() -> dict[str, EntryPoint]:
 
 @dataclass(frozen=True)
 class Reconstruction(Checked):
-    """The way that `reconstruct` turns a view into a mixture, and the weights it uses (docs/weights.md)."""
+    """Settings by which `reconstruct` turns a view into a mixture, and the weights it uses (docs/weights.md)."""
 
     method: str = setting(
         "auto",

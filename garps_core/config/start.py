@@ -36,7 +36,7 @@ def installed_starts() -> dict[str, EntryPoint]:
 
 @dataclass(frozen=True)
 class Start(Checked):
-    """The way that `initialise` finds the start pose."""
+    """Settings by which `initialise` finds the start pose."""
 
     method: str = setting(
         "auto",

@@ -26,7 +26,7 @@ from garps_core.models.resampling import lanczos, nearest_index
 from garps_core.types import Mixture, View
 
 MIN_OPACITY = 1 / 255
-"""Fainter Gaussians change no picture of bytes."""
+"""Smallest opacity of a Gaussian; fainter ones do not change an 8-bit picture."""
 RELATIVE_FLOOR = 1e-6
 ABSOLUTE_FLOOR_M2 = 1e-10
 
@@ -35,7 +35,7 @@ Bool = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Flash3DInput:
-    """What the network is given.
+    """The input of the network.
 
     Args:
         picture: 320x448x3 uint8 RGB, black border.

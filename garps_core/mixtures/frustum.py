@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the camera behind a view could see: depth in range, brightness, and a coarse grid of both (`Frustum`)."""
+"""Frustum of a view: depth in range, brightness, and a coarse grid of both (`Frustum`)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def z_order(height: int, width: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[
 
 
 def frustum_of(view: View, depth: Float32Array, lifting: Lifting) -> Frustum:
-    """What the camera of the view could see, on a coarse grid; depth is HxW m, NaN where unknown."""
+    """Frustum of the view on a coarse grid; depth is HxW m, NaN = unknown."""
     step = FRUSTUM_STEP_PX
     K = view.K.copy()
     K[:2] /= step

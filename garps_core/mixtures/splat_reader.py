@@ -225,7 +225,7 @@ def _fields_of(path: Path, properties: list[list[str]]) -> np.dtype[Any] | None:
 
 
 def _frustum(path: Path, elements: dict[str, _Element], solid: Float64Array) -> Frustum | None:
-    """What the camera in the file could see; None when there is none. solid: Mx3 m, means of what hides things."""
+    """Frustum of the camera in the file, or None without one; solid: Mx3 m, means of the components that occlude."""
     intrinsic, size, extrinsic = (_numbers(path, elements, n) for n in ("intrinsic", "image_size", "extrinsic"))
     if intrinsic is None or size is None:
         return None

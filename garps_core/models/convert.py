@@ -96,7 +96,7 @@ def _entry(source: Path, kind: str, tensors: Mapping[str, torch.Tensor], variant
 
 
 def _size(kind: str, tensors: Mapping[str, torch.Tensor]) -> str:
-    """vits ... vitg by the width of the tokens or of a head; empty for a kind of one size."""
+    """Size of a network, vits to vitg, by the width of the tokens or of a head; empty for a kind of one size."""
     width = 0
     if kind.startswith("ade20k"):
         width = tensors["decode_head.conv_seg.weight"].shape[1] // (4 if kind == "ade20k_ms" else 1)

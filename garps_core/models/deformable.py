@@ -41,7 +41,7 @@ class DeformableAttention(nn.Module):
         self.output_proj = nn.Linear(value_width, width)
 
     def forward(self, query: Tensor, places: Tensor, tokens: Tensor, grids: Sequence[Grid]) -> Tensor:
-        """places: (N, 2). tokens: (B, sum of rows * columns of `grids`, D)."""
+        """Attend to tokens at places (N, 2); tokens: (B, sum of rows * columns of `grids`, D)."""
         shape = (*query.shape[:2], self.heads, self.levels, POINTS)
         offsets: Tensor = self.sampling_offsets(query).reshape(*shape, 2)
         weights: Tensor = self.attention_weights(query).reshape(*shape[:3], -1).softmax(dim=-1).reshape(shape)
@@ -56,7 +56,7 @@ class DeformableAttention(nn.Module):
 
 
 def _looked_up(values: Tensor, places: Tensor, weights: Tensor) -> Tensor:
-    """values (B, C, h, w), places (B, N, heads, points, 2), weights (B, N, heads, points) -> (B, N, C)."""
+    """Sample values (B, C, h, w), places (B, N, heads, points, 2), weights (B, N, heads, points) -> (B, N, C)."""
     batch, queries, heads = places.shape[:3]
     per_head = values.reshape(batch * heads, -1, *values.shape[-2:])
     grid = (2 * places - 1).transpose(1, 2).flatten(0, 1)

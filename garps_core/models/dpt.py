@@ -42,7 +42,7 @@ class FusionBlock(nn.Module):
         self.out_conv = nn.Conv2d(features, features, kernel_size=1)
 
     def forward(self, x: Tensor, skip: Tensor | None = None, grid: Grid | None = None) -> Tensor:
-        """x and skip (B, C, h, w) -> (B, C, *grid); without a grid, twice the size.
+        """Fuse x and skip (B, C, h, w) -> (B, C, *grid); without a grid, twice the size.
 
         The 1x1 convolution stands before the enlargement, where it costs a quarter: both are linear and the weights of
         the enlargement sum to one, so it is the same up to rounding.

@@ -78,7 +78,7 @@ class PaddedConv(nn.Module):
 
 
 class ConvBlock(nn.Module):
-    """The same convolution, followed by ELU."""
+    """A 3x3 convolution, followed by ELU."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()

@@ -179,7 +179,7 @@ class DecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(size.width) for _ in range(3))
 
     def forward(self, x: Tensor, own: Tensor, values: Tensor, positions: Tensor, blocked: Tensor) -> Tensor:
-        """x: queries (B, Q, D), own: their learnt positions, values: a map (B, N, D) with its positions."""
+        """Update queries x (B, Q, D) with learnt positions `own` by a map `values` (B, N, D) with its positions."""
         x = self.norms[0](x + self.attentions[0](x + own, values + positions, values, blocked))
         x = self.norms[1](x + self.attentions[1](x + own, x + own, x))
         x = self.norms[2](self.ffns[0](x))

@@ -96,7 +96,7 @@ class CrossAttention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor, other: Tensor, turn: Rotation, other_turn: Rotation) -> Tensor:
-        """x (B, N, D) and other (B, M, D) -> (B, N, D)."""
+        """Attend from x (B, N, D) to other (B, M, D) -> (B, N, D)."""
         q, k, v = (
             project(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for project, tokens in ((self.projq, x), (self.projk, other), (self.projv, other))
@@ -136,7 +136,7 @@ class DecoderBlock(nn.Module):
         self.mlp = Mlp(size.width)
 
     def forward(self, x: Tensor, other: Tensor, turn: Rotation, other_turn: Rotation) -> Tensor:
-        """x (B, N, D) and other (B, M, D) -> (B, N, D)."""
+        """Attend from x (B, N, D) to other (B, M, D) -> (B, N, D)."""
         x = x + self.attn(self.norm1(x), turn)
         x = x + self.cross_attn(self.norm2(x), self.norm_y(other), turn, other_turn)
         x = x + self.mlp(self.norm3(x))

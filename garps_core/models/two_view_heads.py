@@ -26,7 +26,7 @@ CHANNELS = (96, 192, 384, 768)
 FEATURES = 256
 """Channels of the dense head's fusion."""
 POINT_CHANNELS = 4
-"""x, y, z and confidence, before the activations."""
+"""Channels of a point map: x, y, z and confidence, before the activations."""
 LEAST_LENGTH = 1e-8
 
 

@@ -112,7 +112,7 @@ class LayerScale(nn.Module):
         self.gamma = nn.Parameter(torch.ones(width))
 
     def forward(self, x: Tensor, branch: Tensor) -> Tensor:
-        """x + gamma * branch, both (B, N, D)."""
+        """Add gamma * branch to x, both (B, N, D)."""
         return torch.addcmul(x, branch.to(x.dtype), self.gamma)
 
 

@@ -45,7 +45,7 @@ def loop(function: Loop) -> Loop:
 
 @loop
 def exponential(x: np.float32) -> np.float32:
-    """e^x for -80 < x < 80, relative error 2e-7: 2^n times a polynomial (Cephes expf)."""
+    """Exponential e^x for -80 < x < 80, relative error 2e-7: 2^n times a polynomial (Cephes expf)."""
     n = np.int32(np.int32(x * np.float32(1.44269504) + np.float32(256.5)) - np.int32(256))
     whole = np.float32(n)
     r = x - whole * np.float32(0.693359375) + whole * np.float32(2.12194440e-4)
@@ -61,9 +61,9 @@ def exponential(x: np.float32) -> np.float32:
 
 @loop
 def logarithm(s: np.float32) -> np.float32:
-    """log(1 + s) for finite s >= 0, relative error 1e-6: n log 2 and an odd series of f / (2 + f) (fdlibm's logf).
+    """Logarithm of 1 + s for finite s >= 0, relative error 1e-6: n log 2 and an odd series of f / (2 + f) (fdlibm).
 
-    Below 0.1 its Taylor series, since 1 + s would lose digits that the compiler may not be told to keep.
+    Below 0.1 it is a Taylor series: 1 + s would lose digits, and a compensation would not survive fast math.
     """
     one, half = np.float32(1), np.float32(0.5)
     few = one / np.float32(4) - s * (one / np.float32(5) - s / np.float32(6))

@@ -136,7 +136,10 @@ def _nearest(rows: DeviceMixture, partners: DeviceMixture, T: Array, k: int) -> 
 
 
 def _log_floor(covariances: Tensor, partners: DeviceMixture, floor: float) -> Tensor:
-    """log o_i (n,): `floor` times the density of one partner of mean weight and equal covariance at distance zero."""
+    """Logarithm of the outlier density o_i, (n,).
+
+    o_i is `floor` times the density of one partner of mean weight and equal covariance at distance zero.
+    """
     a, b, c, e, f, i = (2 * covariances).double().unbind(-1)
     det = a * (e * i - f * f) - b * (b * i - c * f) + c * (b * f - c * e)
     scale = torch.log(partners.weights.double().mean() * max(floor, 1e-30))
@@ -144,5 +147,5 @@ def _log_floor(covariances: Tensor, partners: DeviceMixture, floor: float) -> Te
 
 
 def without_floor(pairs: Pairs) -> Pairs:
-    """The same pairs with unit outlier density, as the paper's plain sum needs."""
+    """Replace the outlier density of pairs by 1, for the paper's plain sum."""
     return replace(pairs, log_floor=torch.zeros_like(pairs.log_floor))

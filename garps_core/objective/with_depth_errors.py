@@ -109,7 +109,10 @@ def evaluate_at(pairs: Pairs, state: State, swapped: bool = False) -> Evaluation
 
 
 def backward_jacobian(T: Array, errors: int) -> Array:
-    """d (unknowns of the swapped views) / d (unknowns): (exp(x) T)^-1 = exp(-Ad(T^-1) x) T^-1; errors change places."""
+    """Jacobian of the swapped views' unknowns by the unknowns, (6 + errors, 6 + errors).
+
+    (exp(x) T)^-1 = exp(-Ad(T^-1) x) T^-1, and the errors of both maps change places.
+    """
     B = np.zeros((6 + errors, 6 + errors))
     B[:6, :6] = -adjoint(se3_inverse(T))
     B[6:, 6:] = np.roll(np.eye(errors), errors // 2, axis=0)

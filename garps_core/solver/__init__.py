@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the two views agree best."""
+"""Solvers, which find the pose at which the two views agree best."""

@@ -45,7 +45,7 @@ def paper_pairs(source: DeviceMixture, target: DeviceMixture, T: Array, settings
 
 
 def value_and_gradient(pairs: Pairs, q: Array, t: Array) -> tuple[float, Array, Array]:
-    """f and its gradients over the quaternion q (w, x, y, z; normalised inside) and the translation t (m)."""
+    """Value f and its gradients over the quaternion q (w, x, y, z; normalised inside) and the translation t (m)."""
     T = pose(q, t)
     e = evaluate(pairs, T, "sum")
     f = float(np.exp(e.value))
@@ -99,6 +99,6 @@ def maximise(problem: Problem) -> list[Solution]:
 
 
 def _support(at: State, problem: Problem) -> float:
-    """Share of the components with a partner, on the final pairs of the default method: the plain sum knows none."""
+    """Share of the components with a partner, on the final pairs of the default method; the plain sum has no floor."""
     pairs = final_pairs(at, problem)
     return 0.0 if pairs is None else two_way(*pairs, at, problem.pool).support

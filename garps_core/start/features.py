@@ -31,19 +31,23 @@ class Matches:
     def __len__(self) -> int:
         return len(self.source_px)
 
+    def places(self, kept: npt.NDArray[np.intp]) -> int:
+        """Return how many different places the matches of these indices show, the smaller number of both views.
+
+        A place that is matched in several orientations is one piece of evidence, not several.
+        """
+        return min(len(np.unique(px[kept], axis=0)) for px in (self.source_px, self.target_px))
+
 
 def match_features(source: View, target: View, start: Start) -> Matches:
     """Match RootSIFT features: mutual nearest neighbours that pass the ratio test (Lowe 2004; Arandjelovic 2012).
 
-    SIFT describes one place once per orientation. A pair of places is one match however often it was found: the
-    copies are no further evidence for a pose, and have the same noise.
+    SIFT describes one place once per orientation, so a place may be in several matches (`Matches.places`).
     """
     count = start.max_features
     with ThreadPoolExecutor(2) as pool:
         (px_s, descriptors_s), (px_t, descriptors_t) = pool.map(_describe, (source.rgb, target.rgb), (count, count))
     i, j = _mutual(descriptors_s, descriptors_t, start.match_ratio)
-    _, first = np.unique(np.concatenate([px_s[i], px_t[j]], axis=1), axis=0, return_index=True)
-    i, j = i[np.sort(first)], j[np.sort(first)]
     return Matches(px_s[i], px_t[j], points_at(source, px_s[i]), points_at(target, px_t[j]))
 
 

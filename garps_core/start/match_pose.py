@@ -62,8 +62,10 @@ def pose_from_matches(matches: Matches, source: View, target: View, config: Conf
         raise InitialisationError(f"{len(matches)} feature matches, {has_s.sum()} with depth: no pose fits them")
     inlier_f, inlier_b, T = max(scored, key=lambda s: int(s[0].sum() + s[1].sum()))
     count = int(max(inlier_f.sum(), inlier_b.sum()))
-    if count < need:
-        raise InitialisationError(f"{len(matches)} feature matches, {count} fit one pose: expected at least {need}")
+    places = max(matches.places(np.flatnonzero(has)[fit]) for has, fit in ((has_s, inlier_f), (has_t, inlier_b)))
+    if places < need:
+        counted = f"{count}" if places == count else f"{count} at {places} places"
+        raise InitialisationError(f"{len(matches)} feature matches, {counted} fit one pose: expected at least {need}")
     ways = (keep(forward, inlier_f), keep(backward, inlier_b))
     reason = f"{len(matches)} feature matches, {count} inliers"
     with fixed_pose(reason):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose from the directions of matches, depth giving its length alone: for depth worse than what pixels say.
+"""RANSAC (PoseLib) over matches: absolute pose from 3D points, or relative pose from bearings with depth for its scale.
 
-PnP on depth that is off by a tenth finds few matches that agree with each other, and turns what is wrong with the
-depth into rotation. The essential matrix (five points, PoseLib) needs no depth for rotation and direction.
+PnP on depth that is off by a tenth finds few matches that agree with each other, and turns the errors of depth into
+rotation. The essential matrix (five points) needs no depth for the rotation and the direction of the translation.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from garps_core.start.reprojection import (
 )
 
 MOST_TRIALS = 10_000
-"""Of RANSAC: more costs a second where most matches are wrong."""
+"""Largest number of RANSAC trials; more would take over a second where most matches are wrong."""
 EPIPOLAR_SHARE = 1 / 3
-"""Of `start.ransac_px`, a match's distance from its epipolar line: without depth in it, it is that much smaller."""
+"""Largest distance of an inlier from its epipolar line, as a share of `start.ransac_px`; it holds no depth error."""
 MIN_LENGTHS = 4
-"""Depths that agree with the directions' triangulation; fewer say no length."""
+"""Fewest matches with a positive ratio of measured over triangulated depth; fewer do not determine the scale."""
 
 
 def pose_from_bearings(matches: Matches, K_source: Array, K_target: Array, config: Config) -> Array | None:
-    """4x4 T_target_source, the length of its translation in m the median of measured over triangulated depth.
+    """Estimate 4x4 T_target_source (m); the median ratio of measured to triangulated depth sets its scale.
 
-    None where too few matches fit one pose. Where the cameras only turn the length means nothing, nor does it matter.
+    None where too few matches fit one pose. The scale is arbitrary, and irrelevant, where the cameras only turn.
     """
     if len(matches) < max(5, config.start.min_inliers):
         return None
@@ -52,19 +52,19 @@ def pose_from_bearings(matches: Matches, K_source: Array, K_target: Array, confi
 
 
 def triangulated(T: Array, rays_source: Array, rays_target: Array) -> Array:
-    """Depths (n, 2) at which two rays (n, 3), z = 1, come closest under T_target_source, in its unit."""
+    """Depths (n, 2) in both cameras at which two rays (n, 3), z = 1, come closest; in the unit of T_target_source."""
     along = np.stack([rays_source @ T[:3, :3].T, -rays_target], -1)
     return np.asarray(-np.linalg.pinv(along) @ T[:3, 3])
 
 
 def pinhole(K: Array) -> dict[str, object]:
-    """A camera for PoseLib; the size is of no use to it."""
+    """The camera K (3x3) for PoseLib, which does not use the image size."""
     parameters = [K[index] for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}
 
 
 def ransac(way: OneWay, threshold_px: float, config: Config, least: int = 1000) -> Array | None:
-    """Pose that maps way.points into the camera that saw way.px, after so many trials at least; None without any."""
+    """Find the 4x4 pose from way.points (m) to the camera that saw way.px in at least `least` trials; None without."""
     if len(way.points) < max(4, config.start.min_inliers):
         return None
     trials = {"min_iterations": least, "max_iterations": MOST_TRIALS, "seed": config.seed}

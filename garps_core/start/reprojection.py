@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a match's depth lies, by its measurement and by the pixel that the other camera saw, under a pose.
+"""Reprojection residuals of matches under a pose, with the depth of each match estimated beside the pose.
 
 A depth that is off moves the point's pixel along its epipolar line. Where depth is off by much more than noise
 (`lifting.patch_sigma`) it is an unknown of its own, d = log(depth / measured), beside the pose:
 
     minimise  |pi(T p e^d) - u|^2 / s^2  +  d^2 / p^2          pixel noise s, depth error p
 
-Eliminated, what is left over the pose is a residual with the covariance s^2 1 + p^2 a a', a = d pixel / d d, where all
-derivatives are taken at the likely depth. Taken at the measured one, whose error is in them, they would draw the
-translation to zero, as noise in a regressor does.
+Eliminating d leaves a residual over the pose with the covariance s^2 1 + p^2 a a', a = d pixel / d d. All derivatives
+are taken at the estimated depth. At the measured depth they would contain its error, and draw the translation to zero,
+as noise in a regressor does.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from garps_core.geometry import Array, point_jacobian, project, transform
 DAMPING = 1e-9 * np.eye(6)
 """Added to a Hessian, so that an open direction is not singular."""
 MIN_PIXEL_SIGMA = 0.3
-"""px; no residuals, however small, make a match more precise than features are."""
+"""Smallest sigma of a match's pixel, px; small residuals do not make a match more precise than its feature."""
 HUBER = 2.0
-"""Residuals beyond this many sigmas count with their length, not its square."""
+"""Residuals beyond this many sigmas have a linear cost (Huber's loss)."""
 READINGS_AVERAGE = 3.0
-"""The depth of a match is the mean of 25 readings, whose noise is not independent: so much surer than one of them."""
+"""Ratio of the sigma of one depth reading to that of a match: a mean of 25 readings, whose noise is correlated."""
 Bool = npt.NDArray[np.bool_]
 
 STEPS = 3
-"""Of each match's depth under one pose."""
+"""Gauss-Newton steps of each match's depth under one pose."""
 NO_PARALLAX = 1e-6
-"""Pixels per unit of the logarithm of the depth below which an epipolar line has no direction."""
+"""Smallest pixel motion per unit of log depth for which an epipolar line has a direction, px."""
 FARTHEST = 3.0
-"""Sigmas of its measurement within which a match's depth is looked for."""
+"""Largest change of a match's log depth from its measurement, sigmas."""
 
 
 @dataclass(frozen=True)
 class OneWay:
-    """3D points (n, 3) m of one view and where the other view, with intrinsics K, saw them: px (n, 2)."""
+    """3D points (n, 3) m of one view, and the pixels px (n, 2) at which the other view, with intrinsics K, saw them."""
 
     points: Array
     px: Array
@@ -51,22 +51,22 @@ class OneWay:
 
 @dataclass(frozen=True)
 class Reprojected:
-    """A way's points under a pose, at some depth."""
+    """The points of one direction under a pose, at their estimated depth."""
 
     points: Array
     """(n, 3) m, in the camera that measured them."""
     moved: Array
     """(n, 3) m, in the camera that saw the pixels."""
     by_point: Array
-    """(n, 2, 3) px per metre that a moved point moves there."""
+    """(n, 2, 3) px per metre, derivative of the pixel by the moved point."""
     along: Array
-    """(n, 2) px by which a point moves in the image per unit of the logarithm of its depth."""
+    """(n, 2) px, derivative of the pixel by the logarithm of the point's depth."""
     residual: Array
-    """(n, 2) px, at the measured depth, by the derivative at this one."""
+    """(n, 2) px, residual at the measured depth, linearised at the estimated one."""
 
 
 def reprojected(way: OneWay, T: Array, pixel_sigma: float, depth_sigma: Array) -> Reprojected:
-    """The way under T where depth is off by `depth_sigma` (n,) of its logarithm; zeros leave it as measured."""
+    """Reproject under T (4x4); depth_sigma (n,): sigma of the points' log depth, zeros keep the measured depth."""
     seen = _seen(way, T, np.zeros(len(way.points)))
     if not depth_sigma.any():
         return seen
@@ -88,7 +88,7 @@ def _seen(way: OneWay, T: Array, change: Array) -> Reprojected:
 
 
 def _by_point(points: Array, K: Array) -> Array:
-    """(n, 2, 3) px per metre that points (n, 3) m move in front of the camera that sees them."""
+    """(n, 2, 3) px per metre, derivative of the projection at points (n, 3) m."""
     x, y, z = points.T
     D = np.zeros((len(z), 2, 3))
     D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * x / z**2
@@ -97,7 +97,7 @@ def _by_point(points: Array, K: Array) -> Array:
 
 
 def whitened(seen: Reprojected, pixel_sigma: float, depth_sigma: float) -> Array:
-    """Residuals (n, 2) px with the covariance s^2 1 + p^2 a a' -> with s^2 1: less of what lies along a."""
+    """Residuals (n, 2) px, shrunk along a so that their covariance s^2 1 + p^2 a a' becomes s^2 1."""
     if depth_sigma == 0:
         return seen.residual
     direction, length = _directions(seen.along)
@@ -106,21 +106,21 @@ def whitened(seen: Reprojected, pixel_sigma: float, depth_sigma: float) -> Array
 
 
 def across(seen: Reprojected) -> Array:
-    """(n,) px, residuals across the epipolar lines: what no depth explains."""
+    """(n,) px, residuals across the epipolar lines, which no depth explains."""
     direction, _ = _directions(seen.along)
     return np.asarray(seen.residual[:, 1] * direction[:, 0] - seen.residual[:, 0] * direction[:, 1])
 
 
 def _directions(along: Array) -> tuple[Array, Array]:
-    """Unit vectors (n, 2), any where there is no parallax, and lengths (n, 1) px."""
+    """Unit vectors (n, 2) and lengths (n, 1) px; the unit vector is arbitrary where there is no parallax."""
     length = np.linalg.norm(along, axis=1, keepdims=True)
     return np.where(length > NO_PARALLAX, along / np.maximum(length, NO_PARALLAX), [1.0, 0.0]), length
 
 
 def inliers_of(way: OneWay, T: Array, threshold_px: float, patch_sigma: float = 0.0) -> Bool:
-    """Which of the way's points T brings in front of the camera and within so many pixels of where it saw them.
+    """Mask (n,) of the points that T brings in front of the camera and within `threshold_px` of their pixels.
 
-    Where depth is off by `patch_sigma` from place to place, so many sigmas of that and of one pixel are allowed.
+    With `patch_sigma` (relative error of depth), residuals are whitened to one pixel before they are compared.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = reprojected(way, T, 1.0, np.full(len(way.points), patch_sigma))
@@ -138,15 +138,15 @@ class Normal:
     """Normal equations of one direction over the left twist of the pose that moves its points."""
 
     informations: Array
-    """(n, 6, 6) what each match adds to the Hessian `H`."""
+    """(n, 6, 6) summands of the Hessian `H`, one per match."""
     scores: Array
-    """(n, 6) what each match adds to the gradient `b`."""
+    """(n, 6) summands of the gradient `b`, one per match."""
     from_points: Array
-    """(6, 8) d b per unit of each error that the view which measured the points may share (`depth_errors.py`)."""
+    """(6, 8) derivative of `b` by each error that the measured points may share (`depth_errors.py`)."""
     from_pixels: Array
-    """(6, 8) the same for the view that saw the pixels: only its pointing matters."""
+    """(6, 8) derivative of `b` by each error of the view that saw the pixels; only its pointing matters."""
     residual_px: Array
-    """What tells the noise of pixels: (n, 2), or (n,) across epipolar lines where depth is off by more than noise."""
+    """Residuals for the estimate of pixel noise, px: (n, 2), or (n,) across epipolar lines if `patch_sigma` > 0."""
 
     @property
     def H(self) -> Array:
@@ -160,7 +160,7 @@ class Normal:
 
 
 def normal_equations(way: OneWay, T: Array, pixel_sigma: float, lifting: Lifting) -> Normal:
-    """Of the way's points under T: residuals over the noise of pixels and of the points' depth, made robust (Huber)."""
+    """Normal equations under T: residuals weighted by the noise of pixels and depth, with Huber's loss."""
     sigma = depth_sigma(way.points[:, 2].astype(np.float32), lifting) / READINGS_AVERAGE
     relative = np.hypot(sigma / np.maximum(way.points[:, 2], 1e-6), lifting.patch_sigma)
     seen = reprojected(way, T, pixel_sigma, relative if lifting.patch_sigma > 0 else np.zeros(len(sigma)))

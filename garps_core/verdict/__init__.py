@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to think of an alignment: covariance, status, quality."""
+"""Verdict on an alignment: covariance, status, quality."""

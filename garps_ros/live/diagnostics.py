@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/diagnostics: three checks, once a second, each with a level, a message and lines of `key: value`.
+"""Messages on /diagnostics: three checks, once a second, each with a level, a message and lines of `key: value`.
 
 This is the only place where a line is added: one entry in `_input_lines`, `_estimate_lines`, `_result_lines` or
 `_machine_lines`. Its value comes from `NodeState`, `Counts`, `Arrivals` or `Result`.

@@ -4,6 +4,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -154,7 +155,7 @@ def test_the_cost_falls_with_every_step(refinement: Refinement) -> None:
         T = gauss_newton(T, refinement.linearise, 1)
         costs.append(refinement.cost(T))
     floor = 1e-10 * costs[0]
-    assert all(after < before or before < floor for before, after in zip(costs, costs[1:], strict=False)), costs
+    assert all(after < before or before < floor for before, after in pairwise(costs)), costs
     assert costs[-1] < 1e-2 * costs[0]
 
 

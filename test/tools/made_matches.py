@@ -33,6 +33,8 @@ def pose_from(matches, config=None):
 
 
 def one_place(seed, copies=8, **noise):
-    """The same match many times over: any number of poses fits it."""
+    """The same match many times over, a billionth of a pixel apart: any number of poses fits it."""
     single = exact_matches(seed, count=1, **noise)
-    return Matches(*(np.repeat(part, copies, axis=0) for part in vars(single).values()))
+    repeated = {name: np.repeat(part, copies, axis=0) for name, part in vars(single).items()}
+    apart = 1e-9 * np.arange(copies)[:, None]
+    return Matches(**repeated | {name: repeated[name] + apart for name in ("source_px", "target_px")})

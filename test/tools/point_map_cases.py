@@ -36,7 +36,7 @@ class Errors:
 
 
 def framing_of(height: int, width: int, long_side: int = LONG_SIDE) -> Framing:
-    """As a network of patches: the long side to so many pixels, then the middle in multiples of 16."""
+    """Framing by a network of patches: long side scaled to `long_side` px, then cropped to multiples of 16."""
     factor = long_side / max(height, width)
     rows, columns = round(height * factor), round(width * factor)
     h, w = rows // PATCH * PATCH, columns // PATCH * PATCH

@@ -49,7 +49,7 @@ CALIBRATIONS = {
     "freiburg2": (520.908620, 521.007327, 325.141442, 249.701764),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx, fy, cx, cy in px of the 640x480 colour image."""
+"""Intrinsics fx, fy, cx, cy in px of the 640x480 colour image."""
 DISTORTIONS = {
     "freiburg1": (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
     "freiburg2": (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),

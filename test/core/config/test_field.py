@@ -29,11 +29,7 @@ def test_choices_may_be_a_function_that_is_called_when_they_are_needed() -> None
     assert description(kind)["choices"] == ("candle", "torch")
 
 
-RETIRED = re.compile(
-    r"\b(glances?|sight|sharpen(s|ed)?|beliefs?|beginnings?|systematic|remarks?|troubles?|doubts?|likewise|descends?"
-    r"|climbs?|fit_brightness|worth|initial|says|told|so many)\b",
-    re.IGNORECASE,
-)
+UNCLEAR = re.compile(r"\b(fit_brightness|worth|initial|says|told)\b", re.IGNORECASE)
 CLASSES = (Config, *(type(f.default) for f in fields(Config) if isinstance(f.default, Checked)), Rung, NodeSettings)
 SETTINGS = {f"{kind.__name__}.{f.name}": f for kind in CLASSES for f in fields(kind) if "doc" in f.metadata}
 FULL_NAMES = {*Config().settings(), *(f.name for f in fields(NodeSettings))}
@@ -47,7 +43,7 @@ def test_the_text_of_a_setting_is_complete_in_itself(name: str) -> None:
     words = re.findall(r"[A-Za-z0-9_]+", text.lower())
     assert text[0].isalpha() and len(words) >= 4, "a noun phrase or a sentence"
     assert words[0] not in ("of", "what", "as", "which", "so", "where", "how", "whose", "that"), "begins in the middle"
-    assert not RETIRED.search(text)
+    assert not UNCLEAR.search(text)
     assert {*re.findall(r"`([^`]+)`", text)} <= FULL_NAMES, "a setting is named with its part"
     if f.default == "":
         assert "empty = " in text, "says the meaning of its default"

@@ -187,7 +187,7 @@ def test_a_sensors_settings_and_a_networks_depth_do_not_go_together() -> None:
 
 
 class Memory:
-    """A device's memory for so many pictures: what enters beyond that fails as it does there."""
+    """Memory of a device for a number of pictures; a call with more fails as it does on the device."""
 
     def __init__(self, pictures: int) -> None:
         self.pictures = pictures

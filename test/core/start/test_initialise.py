@@ -15,7 +15,7 @@ from garps_core.errors import InitialisationError
 from garps_core.geometry import inverted, project, se3_exp, se3_inverse, se3_log, transform, twist_from_ros
 from garps_core.metrics import nees, rotation_error_deg, translation_error_m
 from garps_core.start import feature_start
-from garps_core.start.features import match_features
+from garps_core.start.features import Matches, match_features
 from garps_core.start.initialise import combined, initialise
 from garps_core.start.reprojection import READINGS_AVERAGE
 
@@ -229,22 +229,32 @@ def test_matches_carry_the_depth_of_their_pixels():
     assert np.median(np.abs(points[:, 2] / source.depth[row, column] - 1)) < 0.005
     error = np.linalg.norm(project(target.K, transform(truth, points)) - matches.target_px[trusted], axis=1)
     assert np.median(error) < 1.5
-    assert len(np.unique(matches.target_px, axis=0)) > 0.95 * len(matches), "mutual"
+    assert matches.places(np.arange(len(matches))) > 0.8 * len(matches), "mutual, but for several orientations"
 
 
-def test_two_places_are_two_matches_however_many_orientations_they_have():
-    """A disc looks alike from all sides, and SIFT describes it once per direction."""
+def test_a_place_counts_once_however_many_orientations_it_has():
+    """A disc looks alike from all sides, and SIFT describes it once per direction: eight matches may be two places."""
     wall = np.full((240, 320, 3), 128, np.uint8)
     for x, radius in ((90, 5), (220, 8)):
         cv2.circle(wall, (x, 120), radius, (20, 20, 20), -1, cv2.LINE_AA)
     view = View(wall, BLANK.K, BLANK.depth)
     matches = match_features(view, view, Start(match_ratio=1.0))
-    pairs = np.concatenate([matches.source_px, matches.target_px], axis=1)
-    assert len(pairs) and len(np.unique(pairs, axis=0)) == len(pairs)
-    source, target, _ = room(1, 1)
-    found = match_features(source, target, Start())
-    pairs = np.concatenate([found.source_px, found.target_px], axis=1)
-    assert len(np.unique(pairs, axis=0)) == len(pairs)
+    assert len(matches) >= Start().min_inliers and matches.places(np.arange(len(matches))) == 2
+
+
+def test_five_places_are_no_pose_however_often_each_is_matched():
+    exact = exact_matches(count=5)
+    twice = Matches(*(np.repeat(part, 2, axis=0) for part in vars(exact).values()))
+    with pytest.raises(InitialisationError, match="10 at 5 places fit one pose: expected at least 8"):
+        pose_from(twice)
+    assert "10 inliers" in pose_from(twice, Config().replace({"start.min_inliers": 5})).reason
+
+
+def test_places_are_counted_in_the_view_that_has_fewer():
+    exact = exact_matches(count=20)
+    assert exact.places(np.arange(20)) == 20 and exact.places(np.arange(7)) == 7
+    fanned = replace(exact, source_px=np.repeat(exact.source_px[:5], 4, axis=0))
+    assert fanned.places(np.arange(20)) == 5
 
 
 def test_depth_on_a_silhouette_is_not_trusted():

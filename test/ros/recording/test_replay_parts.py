@@ -271,7 +271,7 @@ def test_the_replay_is_told_after_how_many(tmp_path, monkeypatch, lost_after, se
     assert len(list(out.glob("trajectory*.tum"))) == segments
 
 
-def test_a_keyframe_back_in_sight_after_a_blank_view_goes_before_a_new_trajectory():
+def test_a_keyframe_in_view_again_after_a_blank_view_goes_before_a_new_trajectory():
     for bad, last in (((2, 3), "pose"), ((2, 3, 5, 7), "begins")):
         tracker = KeyframeTracker(lambda s, t, bad=bad: estimate(s, t, bad=(4, 6, *bad)), KeyframeRule(0, 99, 9, 2))
         said = followed(tracker, [view(1), view(2), view(3), view(4, 0), view(5), view(6, 0), view(7)])
