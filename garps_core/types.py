@@ -108,7 +108,8 @@ class Prior:
     Args:
         T_target_source: 4x4 rigid motion, source-camera points into the target camera, metres.
         covariance: 6x6 in the ROS order and meaning (module docstring), m^2 and rad^2.
-        origin: who made it: "given", "features", "given and features", "identity", or the name of a two-view network.
+        origin: who made it: "given", "features", "given and features", "identity", or the name of a two-view network or
+            of an installed way to start.
         reason: why this one was used, for people.
     Raises:
         InputError: no rigid motion, covariance not positive definite.

@@ -41,7 +41,8 @@ class Start(Checked):
     method: str = setting(
         "auto",
         "source of the start pose: auto = the given prior and features together, or the one there is, else identity if "
-        "`start.identity_fallback`; features; identity; mast3r, dust3r, adapter = a two-view network, and the prior",
+        "`start.identity_fallback`; features; identity; mast3r, dust3r, adapter = a two-view network, and the prior; "
+        "else the installed way to start of that name, and the prior",
         choices=start_methods,
         live=False,
     )

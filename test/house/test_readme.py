@@ -21,7 +21,7 @@ from garps_ros import replay
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TESTED_ELSEWHERE = ("two_view_models.md", "extending.md")
-"""Pages whose code belongs to another distribution; tests of adapters and of depth networks run it."""
+"""Pages whose code belongs to another distribution; tests of adapters, depth networks and ways to start run it."""
 FOLDERS = ("docs", "garps_core", "garps_ros", "msg_adapters", "bench", "test")
 FILES = [str(path.relative_to(ROOT)) for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
 WEIGHTS_COMMANDS = ("list", "fetch", "verify", "convert", "check")
