@@ -39,6 +39,9 @@ Four = tuple[float, float, float, float]
 Settings = Annotated[
     Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
+Pose = Annotated[
+    str | None, typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"')
+]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
@@ -100,10 +103,7 @@ def align(
     depth_scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the depth files. [integers 0.001, floats 1]")
     ] = None,
-    prior: Annotated[
-        str | None,
-        typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"'),
-    ] = None,
+    prior: Pose = None,
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
     ] = None,
