@@ -17,7 +17,7 @@ from point_map_cases import Errors, point_maps, true_views
 from two_view_fixtures import CALLS, FAULTS, RECORDED, installed_here, installed_package, write_maps
 
 from bench.rooms import RoomPair, make_pair
-from garps_core import Config, ConfigError, PoseEstimate, Prior, Status, View, estimate_relative_pose
+from garps_core import Config, ConfigError, Estimator, PoseEstimate, Prior, Status, View, estimate_relative_pose
 from garps_core.cli import command
 from garps_core.errors import WeightsError
 from garps_core.geometry import se3_exp, se3_inverse, se3_log, twist_from_ros
@@ -187,9 +187,7 @@ def test_points_that_cannot_be_are_no_pose(room: RoomPair, said: PairMaps, tmp_p
 
 
 def mixtures_in(room: RoomPair, settings: Config) -> tuple[PoseEstimate, tuple[Mixture, Mixture] | None]:
-    from garps_core.align import estimate_with_mixtures
-
-    return estimate_with_mixtures(*sensed(room), settings)
+    return Estimator(settings).estimate_with_mixtures(*sensed(room))
 
 
 @pytest.mark.parametrize(("name", "said"), [(name, said) for name, (_, said) in FAULTS.items()], ids=FAULTS)

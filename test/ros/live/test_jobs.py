@@ -380,7 +380,7 @@ def test_clouds_are_of_the_attempt_that_found_a_pose(monkeypatch):
     assert [o.T is None for o in result.outcomes] == [True, False] and result.clouds is not None
 
 
-@pytest.mark.parametrize("told", ["features contradict it", "mast3r contradicts it"])
+@pytest.mark.parametrize("told", ["features contradict it", "mast3r contradicts it", "given_by_marker contradicts it"])
 def test_a_prior_that_the_estimate_did_not_start_from_is_not_called_used(monkeypatch, told):
     start = Prior(np.eye(4), COVARIANCE, told.split()[0])
     answering(monkeypatch, lambda *views: replace(recordings.estimate(*views), initial=start))
