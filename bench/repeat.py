@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences of two runs of `bench.run` on the pairs that both hold, by method: none, if all is well.
+"""Differences of two runs of `bench.run` on the pairs that both hold, by method; a repeated run has none.
 
-python -m bench.run --limit 5 --out out/again
-python -m bench.repeat out/run out/again
+Run the benchmark again, then compare:
+
+    python -m bench.run --limit 5 --out out/again
+    python -m bench.repeat out/run out/again
 """
 
 from __future__ import annotations

@@ -141,6 +141,7 @@ def main(
     try:
         if reuse_peers and reuse_peers.resolve().parent == out.resolve():
             raise ValueError(f"{reuse_peers} lies in --out and would be overwritten: choose another --out")
+        RowLog.check(out, resume)
         chosen, sources = methods_of(methods), data or sources_there()
         plan = [(source, *_asked(source, depth, starts)) for source in sources]
         depths = list(dict.fromkeys(name for _, names, _ in plan for name in names))

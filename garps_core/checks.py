@@ -23,14 +23,14 @@ def checked_intrinsics(K: Any) -> Float64Array:
     if K.shape != (3, 3):
         raise InputError(f"K has shape {K.shape}: expected 3x3, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
     if not np.isfinite(K).all():
-        raise InputError("K holds NaN or infinity: expected finite pixels; check the camera calibration")
+        raise InputError("K holds NaN or infinity: expected finite pixels. Check the camera calibration")
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise InputError(
             f"K has focal lengths fx={K[0, 0]:g}, fy={K[1, 1]:g}: expected both positive, in pixels; "
             "an uncalibrated camera publishes zeros, calibrate it first"
         )
     if np.abs(K[2] - (0, 0, 1)).max() > 1e-9 or K[1, 0] != 0:
-        raise InputError(f"K has last row {K[2].tolist()}: expected [0, 0, 1] and K[1,0] = 0; is it transposed?")
+        raise InputError(f"K has last row {K[2].tolist()}: expected [0, 0, 1] and K[1,0] = 0. Is it transposed?")
     if K[0, 1] != 0:
         raise InputError(f"K has skew {K[0, 1]:g}: expected 0; rectify the image first")
     return np.asarray(K, np.float64)
@@ -63,14 +63,14 @@ def checked_covariance(name: str, covariance: Any) -> Float64Array:
     if C.shape != (6, 6):
         raise InputError(f"{name} has shape {C.shape}: expected 6x6 (x, y, z in m; rotations about X, Y, Z in rad)")
     if not np.isfinite(C).all():
-        raise InputError(f"{name} holds NaN or infinity: expected finite variances; use a large one for unknown")
+        raise InputError(f"{name} holds NaN or infinity: expected finite variances. Use a large one for unknown")
     if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max():
         raise InputError(f"{name} is not symmetric: largest difference {np.abs(C - C.T).max():.3g}, expected 0")
     smallest = float(np.linalg.eigvalsh(0.5 * (C + C.T))[0])
     if smallest <= 0:
         raise InputError(
             f"{name} is not positive definite: smallest eigenvalue {smallest:.3g}, expected above 0; "
-            "zeros do not mean unknown; give every direction a positive variance"
+            "zeros do not mean unknown. Give every direction a positive variance"
         )
     return 0.5 * (C + C.T)
 

@@ -24,7 +24,7 @@ def checked_device(name: str) -> torch.device:
         pass
     there = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
     raise ConfigError(
-        f"device is {name!r}, which is not there: expected one of {', '.join(there)}; set device to 'cpu'"
+        f"device is {name!r}, which is not there: expected one of {', '.join(there)}. Set device to 'cpu'"
     )
 
 
@@ -34,6 +34,6 @@ def on_device(network: Network, device: str) -> Network:
         return network.to(checked_device(device))
     except torch.cuda.OutOfMemoryError as error:
         raise ModelError(
-            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit; free some, "
+            f"out of memory on {device} for the weights of {type(network).__name__}: expected them to fit. Free some, "
             f"choose a smaller network, or use the CPU ({error})"
         ) from None

@@ -113,6 +113,6 @@ def _check_component_values(mixture: Mixture) -> None:
     if smallest.min() <= 0:
         bad = int(smallest.argmin())
         raise InputError(
-            f"covariances are indefinite: component {bad} has eigenvalue {smallest[bad]:.3g} m^2; "
-            "expected positive definite; add a small variance to the diagonal"
+            f"covariances are indefinite: component {bad} has eigenvalue {smallest[bad]:.3g} m^2: "
+            "expected positive definite. Add a small variance to the diagonal"
         )

@@ -73,7 +73,7 @@ def align_mixtures(source: Mixture, target: Mixture, initial: Prior, config: Con
     for name, mixture in (("source", source), ("target", target)):
         if len(mixture) < MIN_ROWS:
             raise InputError(
-                f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}; use a smaller stride"
+                f"{name} has {len(mixture)} components: expected at least {MIN_ROWS}. Use a smaller stride"
             )
     estimate = _aligned(source, target, initial, config)
     estimate.seconds["align"] = time.perf_counter() - begin

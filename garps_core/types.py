@@ -60,7 +60,7 @@ def _checked_rgb(rgb: Any) -> npt.NDArray[np.uint8]:
         given = f"dtype {rgb.dtype}" if isinstance(rgb, np.ndarray) else type(rgb).__name__
         raise InputError(f"rgb is {given}: expected an HxWx3 uint8 array, values 0..255")
     if rgb.ndim != 3 or rgb.shape[2] != 3:
-        raise InputError(f"rgb has shape {rgb.shape}: expected HxWx3; repeat a grey image over three channels")
+        raise InputError(f"rgb has shape {rgb.shape}: expected HxWx3. Repeat a grey image over three channels")
     height, width = rgb.shape[:2]
     if height < 16 or width < 16 or height * width > MAX_IMAGE_PIXELS:
         raise InputError(f"rgb is {width}x{height}: expected at least 16x16 and at most {MAX_IMAGE_PIXELS} pixels")
@@ -97,7 +97,7 @@ def _check_depth_scale(median_m: float) -> None:
         )
     if median_m < MIN_PLAUSIBLE_DEPTH_M:
         raise InputError(
-            f"depth has median {median_m:.4g} m: expected metres; is it a disparity, normalised or in kilometres?"
+            f"depth has median {median_m:.4g} m: expected metres. Is it a disparity, normalised or in kilometres?"
         )
 
 

@@ -22,7 +22,7 @@ SPIN_S = 0.2
 PATIENCE_S = 3.0
 """Time that a computation may go on after a signal before the process ends without it, s."""
 STALL_S = 20.0
-"""Time without a turn of the loop after which the process ends and says where it was, s; a launch file restarts it.
+"""Time without a turn of the loop after which the process prints its traceback and ends, s; a launch file restarts it.
 
 Callbacks take milliseconds, so the node is not the cause: a reader of Fast DDS 2.14 can loop for ever inside
 the call that takes a message, where neither Python's threads nor its signal handlers run. The watch is in C.

@@ -35,6 +35,7 @@ class RowLog:
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any], resume: bool = False) -> None:
+        self.check(folder, resume)
         self.path = folder / ROWS
         self.rows: list[Row] = []
         given = json.loads(json.dumps(options, default=dataclasses.asdict))
@@ -62,9 +63,14 @@ class RowLog:
         with self.path.open("a") as file:
             file.write(json.dumps(rows) + "\n")
 
+    @staticmethod
+    def check(folder: Path, resume: bool) -> None:
+        """Raise ValueError where there is nothing to resume. Called before pairs are made, which takes minutes."""
+        path = folder / ROWS
+        if resume and not path.is_file():
+            raise ValueError(f"{path} does not exist: there is nothing to resume. Run without --resume")
+
     def _read(self, given: Any) -> list[Row]:
-        if not self.path.is_file():
-            raise ValueError(f"{self.path} does not exist: there is nothing to resume; run without --resume")
         first, *lines = self.path.read_text().splitlines() or ["{}"]
         stored = json.loads(first)
         if stored != given:

@@ -39,9 +39,6 @@ Four = tuple[float, float, float, float]
 Settings = Annotated[
     Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
-Pose = Annotated[
-    str | None, typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"')
-]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
@@ -93,8 +90,7 @@ def align(
     target: Annotated[Path, typer.Argument(help="Image of the target camera, or splats (.ply).", metavar="TGT")],
     K: Annotated[Four | None, typer.Option("--K", help="Intrinsics of images, px.", metavar="FX FY CX CY")] = None,
     K_target: Annotated[
-        Four | None,
-        typer.Option("--K-target", help="Intrinsics of the target, px.", metavar="FX FY CX CY"),
+        Four | None, typer.Option("--K-target", help="Intrinsics of TGT, px.", metavar="FX FY CX CY")
     ] = None,
     depth_source: Annotated[
         Path | None, typer.Option(help="Depth registered to SRC: 16-bit PNG (mm), .npy or float TIFF (m).")
@@ -103,7 +99,9 @@ def align(
     depth_scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the depth files. [integers 0.001, floats 1]")
     ] = None,
-    prior: Pose = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"')
+    ] = None,
     prior_sigma: Annotated[
         str | None, typer.Option(help='Its sigmas, m and rad. ["0.1 0.05"]', metavar='"METRES RADIANS"')
     ] = None,
@@ -181,7 +179,7 @@ def _of_splats(
     if of_images or asked or config.reconstruction.method not in ("auto", "ply"):
         raise InputError(
             "splat files come with --K, depth files or settings of reconstruction: expected none, nothing is to be "
-            "reconstructed; leave them out"
+            "reconstructed. Leave them out"
         )
 
     x, y = (read_splats(file) for file in files)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""View -> Mixture."""
+"""Views to mixtures: lifting, Flash3D, and splat files."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """View -> input of Flash3D -> Gaussians -> Mixture.
 
-Intrinsics enter behind the network only. `View.K` counts from pixel centres, the network's grid from pixel edges: half
-a pixel lies between the two.
+The network does not see the intrinsics; they enter after it. `View.K` counts from pixel centres, the network's grid
+from pixel edges: half a pixel lies between the two.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def flash3d_input(view: View) -> Flash3DInput:
     without a depth image, ReconstructionError where it has no reading.
     """
     if view.depth is None:
-        raise MissingDepthError("the view has no depth: Flash3D needs HxW float32 metres; run a depth network first")
+        raise MissingDepthError("the view has no depth: Flash3D needs HxW float32 metres. Run a depth network first")
     height, width = view.depth.shape
     depth = view.depth[np.ix_(nearest_index(height, HEIGHT), nearest_index(width, WIDTH))]
     known = np.isfinite(depth)
@@ -118,7 +118,7 @@ def predict_gaussians(
         network: on any device.
         view: `depth` may come from a sensor or a network; it is taken as it is.
         drop_border: leave out what stands on the border around the picture: 196 608 instead of 286 720 Gaussians. The
-            border is kept by default, as published: its Gaussians say what lies just outside the picture.
+            border is kept by default, as published: its Gaussians stand for surfaces just outside the picture.
         dtype: of the layers that autocast may compute in less than float32; everything behind them never is.
     Raises:
         ReconstructionError: no depth. ConfigError: a dtype that cannot be. ModelError: Gaussians that are not finite,
@@ -136,10 +136,10 @@ def predict_gaussians(
         gaussians = gaussians_of(maps, given.K, given.known, drop_border)
     except torch.cuda.OutOfMemoryError as error:
         raise ModelError(
-            f"out of memory on {device}: Flash3D needs about 1 GB; free some, or use the CPU ({error})"
+            f"out of memory on {device}: Flash3D needs about 1 GB. Free some, or use the CPU ({error})"
         ) from None
     if not (np.isfinite(gaussians.means).all() and np.isfinite(gaussians.covariances).all()):
-        raise ModelError(f"the network returned NaN or infinity in {dtype}: expected Gaussians; is float32 needed?")
+        raise ModelError(f"the network returned NaN or infinity in {dtype}: expected Gaussians. Is float32 needed?")
     return gaussians
 
 
@@ -194,12 +194,12 @@ def gaussians_to_mixture(
     labels: IntArray | None = None,
     along_curve: bool = True,
 ) -> Mixture:
-    """Mixture in the view's optical frame, with what the view's camera could see.
+    """Mixture in the view's optical frame, with the view's frustum.
 
     A weight is the opacity times the area that the pixel covers at the mean, z^2 / (fx fy): as with lifted depth, near
-    surfaces do not count more often than far ones, and what is hardly there hardly counts. The sigmas stay out of it:
-    the network may make one Gaussian large to fill a gap. With `lifting.weighting` "equal" a weight is the opacity
-    alone, which is what the published method thresholds.
+    surfaces do not count more often than far ones. The sigmas are not used, because the network may make one Gaussian
+    large to fill a gap. With `lifting.weighting` "equal" a weight is the opacity alone, on which the published method
+    has its threshold.
 
     Args:
         gaussians: of this view.
@@ -221,7 +221,7 @@ def gaussians_to_mixture(
     if len(kept) < MIN_COMPONENTS:
         raise ReconstructionError(
             f"{len(kept)} usable Gaussians of {len(z)}: expected at least {MIN_COMPONENTS} with opacity from 1/255 and "
-            f"z in {lifting.min_range_m:g}..{lifting.max_range_m:g} m; check the unit of the depth"
+            f"z in {lifting.min_range_m:g}..{lifting.max_range_m:g} m. Check the unit of the depth"
         )
     if along_curve:
         kept = kept[np.argsort(_place_on_curve(gaussians.index[kept]), kind="stable")]

@@ -16,7 +16,7 @@ from garps_core.types import View
 
 MIN_COMPONENTS = 50
 FRUSTUM_STEP_PX = 4
-"""Spacing of the coarse depth map that answers "could that camera see this point"."""
+"""Spacing of the coarse depth map of a frustum, pixels."""
 
 
 def brightness_of(rgb: npt.NDArray[np.uint8], step: int) -> Float32Array:

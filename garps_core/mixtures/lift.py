@@ -5,8 +5,8 @@
     covariance  = footprint of the pixel spacing on the surface + depth uncertainty along the ray
     weight      = surface area the pixel stands for, so that near and flat-on surfaces are not counted more often
 
-The same code serves a depth sensor and a depth network: only the noise model in `Lifting` differs. What a whole depth
-map gets wrong is not in the components; the alignment knows of it (`depth_errors.py`, `with_depth_errors.py`).
+The same code serves a depth sensor and a depth network: only the noise model in `Lifting` differs. Errors that
+a whole depth map shares are not in the components; the alignment models them (`depth_errors.py`).
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def lift(view: View, lifting: Lifting) -> Mixture:
         ReconstructionError: fewer than 50 usable pixels.
     """
     if view.depth is None:
-        raise MissingDepthError("the view has no depth: expected HxW float32 metres; give View(..., depth=...)")
+        raise MissingDepthError("the view has no depth: expected HxW float32 metres. Give View(..., depth=...)")
     depth = in_range(view.depth, lifting)
     rows, columns = _sampled(depth, lifting)
     if len(rows) < MIN_COMPONENTS:
         raise ReconstructionError(
             f"the view has {len(rows)} usable depth pixels of {depth.size} "
-            f"({np.isfinite(view.depth).sum()} with a reading): expected at least {MIN_COMPONENTS}; "
-            "check range limits, units and that the scene is not one edge"
+            f"({np.isfinite(view.depth).sum()} with a reading): expected at least {MIN_COMPONENTS}. "
+            "Check range limits, units and that the scene is not one edge"
         )
     return _lift(view, depth, rows, columns, lifting)
 

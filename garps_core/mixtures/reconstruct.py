@@ -100,7 +100,7 @@ def _of_pair(views: Sequence[View], config: Config, networks: Networks, maps: Pa
         if (count := int(np.isfinite(depth).sum())) < MIN_COMPONENTS:
             raise ReconstructionError(
                 f"{maps.origin} gives {count} of {depth.size} pixels of the {name} depth of which it is surer than "
-                f"{least:g}: expected at least {MIN_COMPONENTS}; do the pictures share anything, are the weights "
+                f"{least:g}: expected at least {MIN_COMPONENTS}. Do the pictures share anything, are the weights "
                 "trained, is start.min_confidence on the network's scale?"
             )
     return [_given(view, depth) for view, depth in zip(views, depths, strict=True)]

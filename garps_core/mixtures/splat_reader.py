@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3D Gaussian Splatting PLY file -> Mixture: what `splat_writer.py` writes, and what other programs write in this form.
+"""Reader of 3D Gaussian Splatting PLY files, by `splat_writer.py` or by other programs, into mixtures.
 
 Per component x y z, f_dc_0..2 (colour as the constant spherical harmonic), opacity (logit), scale_0..2 (log of the
-sigmas), rot_0..3 (quaternion w, x, y, z, any length); other properties are passed over. The coordinates must be those
+sigmas), rot_0..3 (quaternion w, x, y, z, any length); other properties are ignored. The coordinates must be those
 of the camera: x right, y down, z forward, metres. Some programs add the camera as the elements `intrinsic` (3x3
-numbers) and `image_size` (width, height): then the mixture knows what it could see.
+numbers) and `image_size` (width, height): then the mixture gets a frustum.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ SCALES, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2"
 NEEDED = (*MEANS, *COLOURS, "opacity", *SCALES, *ROTATION)
 
 RELATIVE_FLOOR = 1e-3
-"""Least sigma as a share of a component's largest: thinner ones would not be definite in float32."""
+"""Smallest sigma as a share of a component's largest; thinner components would not be definite in float32."""
 SIGMA_FLOOR_M = 1e-5
 SOLID_OPACITY = 0.5
-"""Components from this opacity on hide what lies behind them."""
+"""Smallest opacity of a component that occludes others."""
 FRUSTUM_CELLS = 320
 """Cells of the coarse depth map along the longer side of the picture."""
 
@@ -120,14 +120,14 @@ def _covariances(path: Path, rows: Table) -> tuple[Float64Array, Float32Array]:
 
 
 def _opacities(path: Path, logits: Table) -> Float64Array:
-    """0..1; infinite logits are what writers make of 0 and 1."""
+    """Opacities 0..1 of logits; writers store 0 and 1 as infinite logits."""
     if np.isnan(logits).any():
         raise InputError(f"{path}: opacity of component {int(np.isnan(logits).argmax())} is NaN: expected a logit")
     return np.asarray(1 / (1 + np.exp(-logits.astype(np.float64).clip(-500, 500))))
 
 
 def _columns(path: Path, rows: Table, names: tuple[str, ...]) -> Float64Array:
-    """Those properties as N x len(names) float64, finite."""
+    """Properties by name as N x len(names) float64, finite."""
     table = np.stack([rows[name].astype(np.float64) for name in names], axis=1)
     good = np.isfinite(table).all(axis=1)
     if not good.all():
@@ -157,7 +157,7 @@ def _vertex_of(path: Path, elements: dict[str, _Element]) -> _Element:
 
 
 def _read_table(path: Path, element: _Element) -> Table:
-    """The rows of an element, after a look at the length of the file."""
+    """The rows of an element, after a check of the length of the file."""
     size = path.stat().st_size
     if element.start is None or element.end is None or element.end > size:
         raise InputError(
@@ -189,7 +189,7 @@ def _read_header(path: Path) -> dict[str, _Element]:
 def _check_format(path: Path, formats: list[list[str]]) -> None:
     given = " ".join(formats[0]) if formats else "missing"
     if given != "binary_little_endian 1.0":
-        raise InputError(f"{path}: format is {given}: expected binary_little_endian 1.0; write it again in that format")
+        raise InputError(f"{path}: format is {given}: expected binary_little_endian 1.0. Write it again in that format")
 
 
 def _elements_of(path: Path, lines: list[list[str]], start: int | None) -> dict[str, _Element]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plausibility of a weights file: its tensors, and the answer of its network to one drawn picture.
 
-No test of this repository can see the real weights, so the first person who has them gets a verdict here.
+The tests of this repository have no real weights, so a user who has them checks them here.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _depth_anything(path: Path, found: Tensors, max_depth: float) -> Iterator[Ch
 
 
 def _likeness(depth: Float32Array, true: Float32Array) -> float:
-    """Correlation of the logarithms."""
+    """Correlation of the logarithms of two depth maps."""
     logs = np.log(np.maximum(depth.ravel(), 1e-6)), np.log(true.ravel())
     return float(np.corrcoef(*logs)[0, 1]) if logs[0].std() > 1e-5 else 0.0
 

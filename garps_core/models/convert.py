@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A weights file -> safetensors with the needed tensors alone, and where they came from in its metadata."""
+"""Convert a weights file to safetensors: the needed tensors alone, with their origin in the metadata."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _checked_variant(source: Path, kind: str, variant: str, known: Weights | Non
 
 
 def _entry(source: Path, kind: str, tensors: Mapping[str, torch.Tensor], variant: str) -> Weights:
-    """The table's entry that the tensors belong to: by name, else by kind, size and variant."""
+    """Entry of the manifest to which the tensors belong: by name, else by kind, size and variant."""
     known = of_file(source.name)
     if known is not None and known.kind == kind:
         return known

@@ -2,12 +2,12 @@
 """The demonstration depth network, trained on generated rooms alone and shipped with the package: one image and its
 intrinsics -> depth in metres.
 
-With it two plain images give a pose without any download. It knows nothing of real pictures: docs/demo_net.md has its
-errors. It is used only where it is asked for by name.
+It gives a pose from two plain images without any download. It was not trained on real pictures; docs/demo_net.md
+lists its errors. It is used only if it is selected by name.
 
 A picture of any size is brought to 192x256 pixels. Beside its colours the network gets the slopes x/z and y/z of every
-pixel's ray; it answers with depth over focal length, since that is what a picture by itself can tell. Trained by
-`python -m bench.train_depth`.
+pixel's ray; it returns depth over focal length, the quantity that a picture determines without intrinsics. It is
+trained by `python -m bench.train_depth`.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ BLOCKS = (0, 2, 2, 2, 1)
 MEAN, DEVIATION = 0.45, 0.25
 """Mean and deviation of the colours, 0..1."""
 UNIT_FOCAL_PX = 220.0
-"""A focal length that counts as 1, in pixels of the input."""
+"""Unit of the focal length, in pixels of the input."""
 WHAT_IT_IS = "a demonstration: it knows generated rooms only, its depth of real pictures means little"
 FILE = "demo_net.safetensors"
 MAX_BYTES = 6_000_000
 MAX_ASPECT = 3
-"""Largest ratio of a picture's sides; training had none beyond."""
+"""Largest ratio of a picture's sides, as in training."""
 
 
 class Unit(nn.Sequential):
@@ -73,7 +73,7 @@ class Residual(nn.Module):
 
 
 class DemoNet(nn.Module):
-    """Five levels down, four up, each with what was seen on the way down; at the bottom every place sees the whole."""
+    """Five levels down, four up, each with a skip connection; the coarsest level sees the whole picture."""
 
     def __init__(self, norm: bool = False) -> None:
         super().__init__()
@@ -103,12 +103,12 @@ class DemoNet(nn.Module):
 
 
 def load_network(weights: str, scene: str, device: str) -> DemoNet:
-    """The network in the package on the device; it has no other weights and knows no scene but its own."""
+    """Load the network of the package onto the device; it has one set of weights, so weights and scene do not count."""
     return on_device(shipped(), device)
 
 
 def shipped() -> DemoNet:
-    """The network with the weights of this package, ready to be used. WeightsError where they are not there."""
+    """Build the network with the weights of this package. Raises WeightsError if they are missing."""
     with as_file(files("garps_core.models").joinpath(FILE)) as path:
         tensors = read_tensors(path, max_bytes=MAX_BYTES).tensors
     network = DemoNet()
@@ -158,7 +158,7 @@ def _enlarged(logarithm: Float32Array, focal: float, size: tuple[int, ...]) -> F
     inverse = np.exp(-logarithm) / np.float32(focal)
     depth = np.float32(1) / cv2.resize(inverse, size[::-1], interpolation=cv2.INTER_LINEAR)
     if not np.isfinite(depth).all():
-        raise ModelError("the depth of demo_net is not finite: expected numbers; is its file what was shipped?")
+        raise ModelError("the depth of demo_net is not finite: expected numbers. Is its file what was shipped?")
     return np.asarray(depth, np.float32)
 
 

@@ -57,7 +57,7 @@ TRAINING_FX = 0.5 / np.tan(np.radians(60) / 2)
 """Focal length over image width of the indoor training's cameras: 60 deg wide."""
 DTYPES = {torch.float32, torch.float16, torch.bfloat16}
 AT_THE_END = 0.98
-"""Share of the network's largest depth; a pixel beyond it is at the end of the network's range."""
+"""Share of the network's largest depth beyond which a pixel is at the end of the network's range."""
 
 
 class DepthAnythingV2(nn.Module):
@@ -231,7 +231,7 @@ def network_size(image: RGBImage) -> Grid:
     if max(rows, columns) > LONGEST_SIDE:
         raise InputError(
             f"image of {width}x{height} pixels would enter the network as {columns}x{rows}: expected at most "
-            f"{LONGEST_SIDE} pixels on the longer side, that is {LONGEST_SIDE // SHORT_SIDE} to 1; crop the image"
+            f"{LONGEST_SIDE} pixels on the longer side, that is {LONGEST_SIDE // SHORT_SIDE} to 1. Crop the image"
         )
     return rows, columns
 
@@ -265,7 +265,7 @@ def _passed(model: DepthAnythingV2, inputs: Sequence[Tensor], dtype: torch.dtype
     except torch.cuda.OutOfMemoryError as error:
         rows, columns = inputs[0].shape[-2:]
         raise ModelError(
-            f"out of memory on {device} with one image of {columns}x{rows} pixels: expected it to fit; free memory, "
+            f"out of memory on {device} with one image of {columns}x{rows} pixels: expected it to fit. Free memory, "
             f"choose a smaller model or float16, or run on the CPU ({error})"
         ) from None
 
@@ -276,7 +276,7 @@ def _pass(model: DepthAnythingV2, batch: Tensor, dtype: torch.dtype) -> Tensor:
         depth: Tensor = model(batch)
     if not depth.isfinite().all():
         raise ModelError(
-            f"the network returned NaN or infinity in {dtype}: expected metres; are the weights damaged, or is "
+            f"the network returned NaN or infinity in {dtype}: expected metres. Are the weights damaged, or is "
             "float32 needed?"
         )
     return depth

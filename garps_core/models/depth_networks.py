@@ -70,7 +70,7 @@ def depth_network(name: str) -> DepthNetwork[Any]:
         found: DepthNetwork[Any] = there[name].load()
     if not isinstance(found, DepthNetwork):
         raise ConfigError(
-            f"the depth network {_told(name)} is an object of class {type(found).__name__}: expected a DepthNetwork; "
+            f"the depth network {_told(name)} is an object of class {type(found).__name__}: expected a DepthNetwork. "
             "docs/extending.md shows how to write one"
         )
     return found
@@ -79,7 +79,7 @@ def depth_network(name: str) -> DepthNetwork[Any]:
 def load_network(name: str, weights: str, scene: str, device: str) -> Any:
     """Load a depth network onto a device; its warning is logged by the caller.
 
-    Raises ConfigError for whatever goes wrong in a distribution that is not this one; errors of GARPS pass.
+    Raises ConfigError for any exception in another distribution; errors of GARPS pass unchanged.
     """
     network = depth_network(name)
     with foreign(f"the depth network {_told(name)} cannot be loaded; see its documentation", ConfigError):
@@ -89,13 +89,15 @@ def load_network(name: str, weights: str, scene: str, device: str) -> Any:
 def metric_depths(name: str, loaded: Any, views: Sequence[View], settings: Reconstruction) -> list[Float32Array]:
     """Depth of each view, HxW float32 m along z, by a loaded network.
 
-    Raises ModelError for whatever goes wrong in a distribution that is not this one, or returns anything but finite
-    float32 arrays of the views' sizes; errors of GARPS pass.
+    Raises ModelError for any exception in another distribution, and for results that are not finite float32 arrays of
+    the views' sizes; errors of GARPS pass unchanged.
     """
     with foreign(f"the depth network {_told(name)} failed", ModelError):
         found = list(depth_network(name).depths(loaded, views, settings))
     if len(found) != len(views):
-        raise ModelError(f"the depth network {_told(name)} returned {len(found)} maps for {len(views)} views")
+        raise ModelError(
+            f"the depth network {_told(name)} returned {len(found)} maps: expected {len(views)}, one per view"
+        )
     for view, depth in zip(views, found, strict=True):
         _check(name, view, depth)
     return [depth * np.float32(settings.depth_scale) for depth in found]
@@ -113,7 +115,7 @@ def _check(name: str, view: View, depth: Any) -> None:
 
 
 def _told(name: str) -> str:
-    """The name, and where it comes from if not from this package."""
+    """Name of a depth network, with its distribution if that is another one."""
     point = installed_depth_networks().get(name)
     return name if point is None else told(point)
 
@@ -167,7 +169,7 @@ def depth_from(views: Sequence[View], config: Config) -> str:
 
 
 def with_weights(settings: Reconstruction) -> str:
-    """The depth network of the settings with its warning, else with its weights or, without any, its description.
+    """Describe the depth network of the settings: with its warning, else its weights, else its description.
 
     Raises WeightsError where weights of the list are needed and none are installed.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flash3D (Szymanowicz et al., 2024): a picture with metric depth -> two 3D Gaussians per pixel, one behind the other.
 
-Only the part behind the depth network, which may be any; parameters named as in the published file.
+This is the part after the depth network, which may be any; its parameters are named as in the published file.
 `flash3d.py` makes the input from a view and a mixture from the output.
 
     layer 0 stands on the given depth, layer 1 behind it: depth_1 = depth_0 + exp(clamp(r, -10, 6))
@@ -25,9 +25,9 @@ from garps_core.weights.state_dict import load_strictly
 
 LAYERS = 2
 HEIGHT, WIDTH = 256, 384
-"""Size the picture is brought to, pixels."""
+"""Size of the resized picture, pixels."""
 PAD = 32
-"""Border around it, pixels on every side."""
+"""Border around the resized picture, pixels on every side."""
 PADDED = (HEIGHT + 2 * PAD, WIDTH + 2 * PAD)
 
 GAUSSIAN_CHANNELS = (32, 32, 64, 128, 256)
@@ -174,7 +174,7 @@ def _activated(depth: Tensor, step: Tensor, raw: Tensor) -> GaussianMaps:
 
 
 def flash3d_tensors(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, int]]:
-    """Pick the tensors of `Flash3D` from what a published file holds under "model".
+    """Pick the tensors of `Flash3D` from the entry "model" of a published file.
 
     Such a file also holds the authors' depth network, under another licence: that is never read.
 
@@ -195,7 +195,7 @@ def flash3d_tensors(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dic
             tensor = torch.zeros((), dtype=torch.int64)
         if tensor is None:
             raise WeightsError(
-                f"no {prefix + name}: expected all {len(expected)} tensors of Flash3D; is the file whole?"
+                f"no {prefix + name}: expected all {len(expected)} tensors of Flash3D. Is the file whole?"
             )
         if tensor.shape != like.shape:
             raise WeightsError(
@@ -231,7 +231,7 @@ def _prefix_of(state: Mapping[str, Tensor]) -> str:
     if len(found) != 1:
         raise WeightsError(
             f"{len(found)} keys end in {FIRST_KEY} with shape {shape} among {len(state)} tensors "
-            f"({', '.join(list(state)[:3])}, ...): expected one; is this the file of Flash3D?"
+            f"({', '.join(list(state)[:3])}, ...): expected one. Is this the file of Flash3D?"
         )
     return found[0].removesuffix(FIRST_KEY)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks of one owner: loaded when they are first needed, kept, asked for depth, labels or point maps.
+"""The networks of one owner: loaded on first use and kept; they give depth, labels and point maps.
 
 This module is light to import: the file of a network is imported when that network is asked for.
 """

@@ -289,7 +289,7 @@ def segment_by_masks(network: Mask2Former, image: RGBImage) -> Labels:
             f"out of memory on {device} with {width}x{height} pixels: give a smaller image ({error})"
         ) from None
     if not scores.isfinite().all():
-        raise ModelError("the network returned NaN or infinity: expected scores; are the weights damaged?")
+        raise ModelError("the network returned NaN or infinity: expected scores. Are the weights damaged?")
     rows, columns = (
         torch.from_numpy(stretching(cells, whole)[:side]).to(device, torch.float32)
         for cells, whole, side in zip(scores.shape[1:], picture.shape[2:], (height, width), strict=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MASt3R and DUSt3R as two-view models: pictures -> what the network sees of them -> point maps in both orders."""
+"""MASt3R and DUSt3R as two-view models: pictures -> framed inputs -> point maps in both orders."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LONG_SIDE = 512
 SQUARE_SIDE = {"linear-224": 224}
 """Side, in pixels, of the square that a variant sees (`manifest.Weights.variant`); the others see most of a picture."""
 MOST_ELONGATED = 8
-"""Times the shorter side: the longest picture that is taken."""
+"""Largest ratio of a picture's sides."""
 KEPT = 4
 """Pictures whose encoding is kept, for the next pairs that they are part of."""
 
@@ -60,8 +60,8 @@ def _resized(rgb: Picture, long_side: int) -> Picture:
     longest, shortest = max(height, width), min(height, width)
     if shortest < PATCH or longest > MOST_ELONGATED * shortest:
         raise InputError(
-            f"image of {width}x{height} pixels: expected at least {PATCH}x{PATCH}, and at most {MOST_ELONGATED} to 1; "
-            "crop the image"
+            f"image of {width}x{height} pixels: expected at least {PATCH}x{PATCH}, and at most {MOST_ELONGATED} to 1. "
+            "Crop the image"
         )
     rows, columns = (round(side * long_side / longest) for side in (height, width))
     return (lanczos if longest > long_side else bicubic)(rgb, rows, columns)
@@ -92,8 +92,8 @@ class _Encoded:
 class NaverModel:
     """A `TwoViewModel`: every picture is encoded once, and both orders are decoded.
 
-    What can be is done at once for both pictures and for both orders; that changes results by rounding only. Threads
-    take turns.
+    Both pictures and both orders share one pass where possible, which changes results by rounding only. Threads take
+    turns.
 
     Args:
         network: of any device; it may be moved between calls.
@@ -165,11 +165,11 @@ class NaverModel:
         return list(zip(one, two, strict=True))
 
     def _point_maps(self, maps: ViewMaps) -> list[PointMap]:
-        """One per view of the batch. Raises ModelError for values that are not finite."""
+        """Point maps, one per view of the batch. Raises ModelError for values that are not finite."""
         parts = [part for part in (maps.points, maps.confidence, maps.descriptors) if part is not None]
         if not all(bool(part.isfinite().all()) for part in parts):
             raise ModelError(
-                f"the network returned NaN or infinity in {self.dtype}: expected points; are the weights damaged, or "
+                f"the network returned NaN or infinity in {self.dtype}: expected points. Are the weights damaged, or "
                 "is float32 needed?"
             )
         return [PointMap(*views) for views in zip(*map(_arrays, parts), strict=True)]
@@ -185,13 +185,13 @@ class NaverModel:
             return [found for part in parts for found in run([part])]
         except torch.cuda.OutOfMemoryError as error:
             raise ModelError(
-                f"out of memory on {self._device} with one pair of pictures: expected it to fit; free memory, choose "
+                f"out of memory on {self._device} with one pair of pictures: expected it to fit. Free memory, choose "
                 f"float16, or run on the CPU ({error})"
             ) from None
 
 
 def digest(picture: Picture) -> bytes:
-    """Two pictures share it only if they are equal."""
+    """Key of a picture in the cache; two pictures share it only if they are equal."""
     return hashlib.blake2b(np.ascontiguousarray(picture).data, key=str(picture.shape).encode()).digest()
 
 

@@ -105,7 +105,7 @@ def segmenter_of(backbone: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> 
     if channels not in [count * SIZES[size].width for count in LAST_BLOCKS]:
         raise WeightsError(
             f"the head reads {channels} channels, the backbone is {size} of width {SIZES[size].width}: expected the "
-            "width (linear) or four times it (ms); take the head that was published for this backbone"
+            "width (linear) or four times it (ms). Take the head that was published for this backbone"
         )
     with torch.device("meta"):
         network = Segmenter(size, channels // SIZES[size].width, classes)
@@ -197,7 +197,7 @@ def scores_of(
             f"out of memory on {device} with {size[1]}x{size[0]} pixels: choose a smaller backbone or the CPU ({error})"
         ) from None
     if not patches.isfinite().all():
-        raise ModelError(f"the network returned NaN or infinity in {dtype}: expected scores; is float32 needed?")
+        raise ModelError(f"the network returned NaN or infinity in {dtype}: expected scores. Is float32 needed?")
     axes = zip(patches.shape[1:], size, (height, width), strict=True)
     rows, columns = (torch.from_numpy(_spreading(*axis, official)).to(device, torch.float32) for axis in axes)
     return Scores(patches @ (columns.flip(0) if mirrored else columns).T, rows)

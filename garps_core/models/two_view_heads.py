@@ -142,7 +142,7 @@ class LinearHead(nn.Module):
         self.proj = nn.Linear(decoder, POINT_CHANNELS * PATCH**2)
 
     def forward(self, tokens: Sequence[Tensor], grid: Grid) -> ViewMaps:
-        """Return what `DenseHead` returns."""
+        """Return points and confidence as `DenseHead` does."""
         return ViewMaps(*activated(pixels(self.proj(tokens[-1]), grid)))
 
 

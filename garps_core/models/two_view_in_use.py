@@ -38,7 +38,7 @@ def load_adapter(name: str, weights: str, device: str) -> TwoViewModel:
     if name not in there:
         raise ConfigError(
             f"start.adapter is {name!r}: expected the name of an installed adapter, one of "
-            f"{', '.join(sorted(there)) or 'none there are'}; docs/two_view_models.md shows how to write one"
+            f"{', '.join(sorted(there)) or 'none there are'}. docs/two_view_models.md shows how to write one"
         )
     try:
         load: Callable[[str, str], TwoViewModel] = there[name].load()
@@ -50,7 +50,7 @@ def load_adapter(name: str, weights: str, device: str) -> TwoViewModel:
 
 
 def maps_by_adapter(name: str, model: TwoViewModel, source: Picture, target: Picture) -> PairMaps:
-    """Point maps by an adapter. Raises ModelError for whatever goes wrong in it, or is not `PairMaps`."""
+    """Point maps by an adapter. Raises ModelError for any exception in it, or a result that is not `PairMaps`."""
     try:
         found = model(source, target)
     except (ConfigError, InputError, WeightsError):

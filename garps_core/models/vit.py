@@ -105,7 +105,7 @@ class SwiGlu(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """Learned factor per channel of what a branch adds to the tokens."""
+    """Learned factor per channel of the branch that is added to the tokens (layer scale)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -198,7 +198,7 @@ def size_of(tensors: Mapping[str, Tensor], prefix: str = "") -> str:
     if token is None:
         raise WeightsError(
             f"no {prefix}cls_token among {len(tensors)} tensors ({_some(tensors)}): expected the weights of a DINOv2 "
-            "transformer; is this the file of another network, or of a head alone?"
+            "transformer. Is this the file of another network, or of a head alone?"
         )
     width = token.shape[-1]
     start = f"{prefix}blocks."

@@ -55,8 +55,8 @@ def _sure(px_s: Array, px_t: Array, maps: PairMaps, config: Config) -> tuple[Arr
     sure = on_source & on_target
     if not sure.any():
         raise InitialisationError(
-            f"{maps.origin}: of {len(sure)} matches none is surer than {config.start.min_confidence:g} on both sides; "
-            "do the pictures share anything, are the weights trained?"
+            f"{maps.origin}: of {len(sure)} matches none is surer than {config.start.min_confidence:g} on both sides. "
+            "Do the pictures share anything, are the weights trained?"
         )
     return px_s[sure], px_t[sure]
 

@@ -18,7 +18,7 @@ from garps_core.types import View
 
 @dataclass(frozen=True)
 class Matches:
-    """n matched pixels, and the 3D point of each in its own camera (NaN where the depth cannot be trusted).
+    """Pairs of matched pixels, and the 3D point of each pixel in its own camera; NaN where its depth is not trusted.
 
     source_px, target_px: (n, 2) pixels; source_points, target_points: (n, 3) m.
     """

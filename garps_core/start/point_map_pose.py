@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Point maps of a pair -> pose with covariance: PnP of one picture's pixels against their points in the other camera.
 
-Each order of the pair gives a pose; the one whose maps are surer of themselves is kept (as the authors of DUSt3R do),
-refined on its inliers. Neighbouring pixels err alike: how much less they are worth than so many independent ones, is
-measured by adding up their residuals in blocks of the picture. The covariance also grows where the two orders
-contradict each other, and gets what all points share: an error of scale and a smooth warp (`depth_errors.py`).
+Each order of the pair gives a pose. The order with the more confident maps is kept, as the authors of DUSt3R do, and
+refined on its inliers. Errors of neighbouring pixels are correlated; the sums of their residuals over blocks of the
+picture measure by how much this widens the covariance. The covariance is also widened where the two orders contradict
+each other, and by the errors that all points share: scale and a smooth warp (`depth_errors.py`).
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from garps_core.start.reprojection import DAMPING, MIN_PIXEL_SIGMA, Normal, OneW
 from garps_core.types import Prior, View
 
 STEP_PX = 4
-"""Every so many pixels of a map, both ways, are used: its neighbours say the same."""
+"""Spacing of the pixels of a map that are used, in both directions; those between them add nothing."""
 THRESHOLD_PX = 5.0
-"""Inliers are nearer, in pixels of the map (Wang et al. 2024)."""
+"""Largest reprojection error of an inlier, in pixels of the map (Wang et al. 2024)."""
 MIN_TRIALS = 50
-"""Of the robust estimate: most pixels of a map that is any good fit."""
+"""Smallest number of trials of RANSAC. Few are enough: most pixels of a good map fit."""
 MIN_SHARE = 0.2
-"""Of the trusted pixels that have to fit one pose; a network that fails gives points that fit none."""
+"""Share of the trusted pixels that must fit one pose. The points of a network that fails fit none."""
 MIN_TRUSTED = 100
+"""Smallest number of trusted pixels to compute a pose from."""
 BLOCKS = 6
 """Blocks along the longer side of the trusted part whose residuals count as independent of each other's."""
 
@@ -48,17 +49,17 @@ class _Order:
     framings: tuple[Framing, Framing]
     maps: tuple[PointMap, PointMap]
     trusted: tuple[Bool, Bool]
-    """Of the first's and the second's pixels."""
+    """Masks of the trusted pixels of the first and of the second picture."""
 
     @property
     def score(self) -> float:
-        """How sure the network is of this order."""
+        """Confidence of the network in this order: the product of the mean confidences of both maps."""
         return float(self.maps[0].confidence.mean() * self.maps[1].confidence.mean())
 
 
 @dataclass(frozen=True)
 class _Pose:
-    """T_second_first, the covariance of its left twist without what all points share, and that for one sigma each."""
+    """T_second_first with two covariances of its left twist: by noise, and by the errors that all points share."""
 
     T: Array
     noise: Array
@@ -66,17 +67,17 @@ class _Pose:
     reason: str
 
     def inverted(self) -> _Pose:
-        """Of the pair the other way round."""
+        """Return the pose of the swapped pair."""
         inverse = se3_inverse(self.T)
         A = adjoint(inverse)
         return replace(self, T=inverse, noise=A @ self.noise @ A.T, shared=A @ self.shared @ A.T)
 
 
 def pose_from_maps(maps: PairMaps, source: View, target: View, config: Config) -> Prior:
-    """Initial pose with covariance; `Prior.reason` says which order, how many pixels, and whose metres.
+    """Return the start pose with covariance; its `reason` names order, pixels and source of the scale.
 
     Args:
-        maps: of source and target.
+        maps: point maps of source and target.
         source, target: intrinsics, and where `start.scale` asks for it, depth.
         config: `start`, `lifting` and `seed` are used.
     Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetch a weights file from the hub, on a person's demand only. The one place of the packages that uses the network."""
+"""Fetch a weights file from the hub, on a user's demand only. No other module of the packages uses the network."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class _Offer:
 def fetch(name: str, accepted: str | None = None, say: Callable[[str], None] = print) -> Path:
     """Put a file into the weights folder, whole and checked, or not at all.
 
-    The hub is `$HF_ENDPOINT`, by default the public one. A broken connection is taken up again where it broke.
+    The hub is `$HF_ENDPOINT`, by default the public one. A broken download continues where it stopped.
 
     Args:
-        name: of the weights.
+        name: name of the weights.
         accepted: the same name again, for a licence that is not permissive.
-        say: is told the licence first, then the progress.
+        say: called with the licence first, then with the progress.
     Returns:
-        where it lies.
+        Path of the file.
     Raises:
         WeightsError: licence not accepted, not on the hub, no connection, no room, or not the file that was expected.
     """
@@ -51,7 +51,7 @@ def fetch(name: str, accepted: str | None = None, say: Callable[[str], None] = p
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise WeightsError(f"cannot make {folder} ({error.strerror}): expected a folder; set GARPS_WEIGHTS") from None
+        raise WeightsError(f"cannot make {folder} ({error.strerror}): expected a folder. Set GARPS_WEIGHTS") from None
     hub = _hub()
     offer = _offered(hub, weights)
     _check_size(weights, offer, folder)
@@ -87,7 +87,7 @@ def _hub() -> Any:
         import huggingface_hub
     except ImportError:
         raise WeightsError(
-            "huggingface_hub is not installed: expected it for fetching; run `pip install huggingface_hub`, or "
+            "huggingface_hub is not installed: expected it for fetching. Run `pip install huggingface_hub`, or "
             "download the file on another machine, see docs/weights.md"
         ) from None
     return huggingface_hub
@@ -118,7 +118,7 @@ def _check_size(weights: Weights, offer: _Offer, folder: Path) -> None:
     free = shutil.disk_usage(folder).free
     if free < offer.size:
         raise WeightsError(
-            f"{folder} has {free / 1e6:.0f} MB free: expected {offer.size / 1e6:.0f}; make room or set GARPS_WEIGHTS"
+            f"{folder} has {free / 1e6:.0f} MB free: expected {offer.size / 1e6:.0f}. Make room or set GARPS_WEIGHTS"
         )
 
 
@@ -159,5 +159,5 @@ def _failed(weights: Weights, error: Exception) -> WeightsError:
     reason = (str(error).strip().splitlines() or [""])[0]
     return WeightsError(
         f"cannot fetch {weights.file} of {weights.repo} from {_endpoint() or 'the hub'} "
-        f"({type(error).__name__}: {reason}): expected a connection; try again, or {by_hand(weights)}"
+        f"({type(error).__name__}: {reason}): expected a connection. Try again, or {by_hand(weights)}"
     )

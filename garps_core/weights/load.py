@@ -40,7 +40,7 @@ def _read(weights: str, kind: str, variant: str) -> tuple[Path, Tensors]:
         return path, read_tensors(path, kind=kind)
     entry, there = named(name), installed(name)
     if entry.kind != kind:
-        raise WeightsError(f"{name} are weights of {entry.kind}: expected some of {kind}; see `garps weights list`")
+        raise WeightsError(f"{name} are weights of {entry.kind}: expected some of {kind}. See `garps weights list`")
     if there is None:
         raise WeightsError(f"{name} is not installed: run `garps weights fetch {name}`, or name another file")
     return there, read_tensors(there, max_bytes=entry.bytes or entry.bytes_bound, sha256=entry.sha256, kind=kind)

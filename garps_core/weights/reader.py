@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights file -> tensors, without trusting the file. The only place of the packages that opens one.
+"""Safe reader of weights files: tensors from a file that is not trusted. No other module of the packages opens one.
 
 A torch file is a pickle, which can run any code when it is opened carelessly. Here nothing but tensors and plain values
 is ever built from it (`weights_only=True`), there is no other way to fall back to, and sizes are bounded beforehand.
@@ -28,7 +28,7 @@ from garps_core.weights.manifest import NEEDS_NAMESPACE
 from garps_core.weights.store import CHECKSUMS, recorded, weights_folder
 
 MAX_BYTES = 8 * 2**30
-"""Default bound of a file: the largest network that is known, with room."""
+"""Default bound of a file in bytes, above the largest known network."""
 MAX_HEADER = 32 * 2**20
 MAX_ENTRIES = 200_000
 MAX_PICKLE = 64 * 2**20
@@ -79,7 +79,7 @@ def read_tensors(
     before = real.stat()
     if before.st_size > max_bytes:
         raise WeightsError(
-            f"{path} has {before.st_size} bytes: expected at most {max_bytes}; is it the file that was meant?"
+            f"{path} has {before.st_size} bytes: expected at most {max_bytes}. Is it the file that was meant?"
         )
     found = hash_of(real)
     known = recorded(path, folder)
@@ -98,7 +98,7 @@ def read_tensors(
         )
     after = real.stat()
     if (before.st_ino, before.st_size, before.st_mtime_ns) != (after.st_ino, after.st_size, after.st_mtime_ns):
-        raise WeightsError(f"{path} changed while it was read: expected a finished file; try again")
+        raise WeightsError(f"{path} changed while it was read: expected a finished file. Try again")
     return Tensors(tensors, metadata, found)
 
 
@@ -110,7 +110,7 @@ def regular_file(path: Path, folder: Path) -> Path:
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise WeightsError(
-            f"cannot read {path} ({reason}): expected a weights file; see `garps weights list`"
+            f"cannot read {path} ({reason}): expected a weights file. See `garps weights list`"
         ) from None
     if not stat.S_ISREG(mode):
         what = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
@@ -118,7 +118,7 @@ def regular_file(path: Path, folder: Path) -> Path:
         raise WeightsError(f"{path} is {found}: expected a regular file of weights")
     inside = path.absolute().is_relative_to(folder.absolute())
     if inside and not real.is_relative_to(folder.resolve()):
-        raise WeightsError(f"{path} leads out of the weights folder, to {real}: expected a file in it; copy it there")
+        raise WeightsError(f"{path} leads out of the weights folder, to {real}: expected a file in it. Copy it there")
     return real
 
 
@@ -166,14 +166,14 @@ def _of_safetensors(path: Path, real: Path, header: int) -> tuple[dict[str, torc
     if not (2 <= header <= room and begins_well):
         raise WeightsError(
             f"{path} is neither a torch zip file nor safetensors (header of {header} bytes, expected 2 to {room}): "
-            "truncated or another kind of file; fetch it again"
+            "truncated or another kind of file. Fetch it again"
         )
     try:
         with safe_open(real, framework="pt", device="cpu") as opened:
             metadata = dict(opened.metadata() or {})
             return {key: opened.get_tensor(key) for key in opened.keys()}, metadata  # noqa: SIM118 (not a mapping)
     except Exception as error:  # its own class of error, and whatever else a hostile file provokes
-        raise WeightsError(f"{path} is no sound safetensors file ({error}): damaged; fetch it again") from None
+        raise WeightsError(f"{path} is no sound safetensors file ({error}): damaged. Fetch it again") from None
 
 
 def _of_torch_file(path: Path, real: Path, kind: str | None) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -221,7 +221,7 @@ def _check_zip(path: Path, real: Path) -> None:
         with zipfile.ZipFile(real) as archive:
             entries = archive.infolist()
     except Exception as error:  # BadZipFile, and what else a damaged directory provokes
-        raise WeightsError(f"{path} is no sound torch file ({error}): truncated or damaged; fetch it again") from None
+        raise WeightsError(f"{path} is no sound torch file ({error}): truncated or damaged. Fetch it again") from None
     unpacked = sum(entry.file_size for entry in entries)
     packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
     if packed or unpacked > size or len(entries) > MAX_ENTRIES:

@@ -80,8 +80,8 @@ def record(folder: Path, file: str, entry: Record) -> None:
         handle, temporary = tempfile.mkstemp(dir=folder, prefix=".checksums-")
     except OSError as error:
         raise WeightsError(
-            f"cannot write {folder / CHECKSUMS} ({error.strerror}): expected a folder that this user may write; "
-            "verify as the user it belongs to"
+            f"cannot write {folder / CHECKSUMS} ({error.strerror}): expected a folder that this user may write. "
+            "Verify as the user it belongs to"
         ) from None
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
@@ -96,14 +96,14 @@ def _records(folder: Path) -> dict[str, Record]:
     path = folder / CHECKSUMS
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise WeightsError(f"{path} is larger than {_MAX_BYTES} bytes: expected a few checksums; remove it")
+            raise WeightsError(f"{path} is larger than {_MAX_BYTES} bytes: expected a few checksums. Remove it")
         content = json.loads(path.read_text(encoding="utf-8"))
         found = {name: Record(**entry) for name, entry in content.items()}
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise WeightsError(f"cannot read {path} ({error}): expected recorded checksums; repair or remove it") from None
+        raise WeightsError(f"cannot read {path} ({error}): expected recorded checksums. Repair or remove it") from None
     for name, entry in found.items():
         if not (isinstance(entry.sha256, str) and re.fullmatch("[0-9a-f]{64}", entry.sha256)):
-            raise WeightsError(f"{path} has no sha256 for {name}: expected 64 hexadecimal digits; repair or remove it")
+            raise WeightsError(f"{path} has no sha256 for {name}: expected 64 hexadecimal digits. Repair or remove it")
     return found

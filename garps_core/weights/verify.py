@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is a file what it is called? Hash, content and network are compared; what is new is recorded."""
+"""Verification of a weights file: its hash, content and network against its name; a new hash is recorded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from garps_core.weights.store import Record, installed, record, recorded, weight
 
 
 def verify(name: str) -> str:
-    """Check an installed file, record its hash if there is none yet; returns what was found, in words.
+    """Check an installed file, record its hash if there is none yet, and describe the file in words.
 
     Raises:
         WeightsError: not installed, changed since it was recorded, damaged, or another network than its name says.
@@ -37,7 +37,7 @@ def examined(path: Path, weights: Weights, folder: Path) -> Tensors:
     kind = kind_of(found.tensors)
     if kind != weights.kind and not (kind == "" and weights.kind.startswith("ade20k") and _is_head(found)):
         raise WeightsError(
-            f"{path} holds {recognised(found.tensors)}: expected {weights.kind}, as {weights.name} is; fetch it again"
+            f"{path} holds {recognised(found.tensors)}: expected {weights.kind}, as {weights.name} is. Fetch it again"
         )
     return found
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera followed against keyframes: when to take a new one, and how poses and covariances add up."""
+"""Keyframe tracking of one camera: the rule for new keyframes, and the chaining of poses and covariances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from garps_ros.parameters.settings import NodeSettings
 Estimate = Callable[[View, View], PoseEstimate]
 """A function (source, target) -> pose of the source camera in the target camera."""
 MIN_DEPTH_SHARE = 0.02
-"""Share of pixels with depth below which a view begins no segment; it tells a covered lens from a sparse sensor."""
+"""Smallest share of pixels with depth for a view to begin a segment; a covered lens has less than a sparse sensor."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class KeyframeTracker:
         if self._keyframe is None and share < self.rule.min_depth_share:
             raise ReconstructionError(
                 f"the view has depth at {share:.1%} of its pixels: expected at least {self.rule.min_depth_share:.0%} "
-                "to begin a trajectory; uncover the camera, or check the depth topic"
+                "to begin a trajectory. Uncover the camera, or check the depth topic"
             )
         # A covered lens may be uncovered by now: after a blank view the keyframe gets one more try.
         patience = self.rule.lost_after + self._was_blank

@@ -74,7 +74,7 @@ class Outcome:
 
 
 class ViewReader:
-    """Makes a View of a Frame; says which calibration is used, at first and whenever that changes.
+    """Makes a View of a Frame, and logs the calibration in use at first and whenever it changes.
 
     Args:
         rectified: "auto", "rectified" or "raw".
@@ -86,7 +86,7 @@ class ViewReader:
         self.rectified, self.allow_resized, self._say = rectified, allow_resized, say
         self._said: dict[str, str] = {}
         self.warnings: dict[str, str] = {}
-        """Image topic -> why the last frame read may hold another camera's calibration or depth; "" = no warning."""
+        """Image topic -> warning that the last frame may hold another camera's calibration or depth; "" = none."""
 
     def read(self, frame: Frame) -> View:
         """Decode, choose the calibration, undistort. Raises MessageError or InputError."""

@@ -25,7 +25,7 @@ from garps_core.types import Prior, View
 from garps_ros.estimates.keyframes import MIN_DEPTH_SHARE
 
 LONG_S = 2.0
-"""Time of compiling beyond which a line is logged, s; loops that are read from the cache take less."""
+"""Time of compiling beyond which a line is logged, s; reading compiled loops from the cache takes less."""
 
 
 def methods_without_sensor() -> tuple[str, ...]:
@@ -39,7 +39,7 @@ def needs_depth(config: Config) -> bool:
 
 
 def check_method(config: Config) -> None:
-    """Raises ConfigError where `reconstruction.method` wants no images, or settings do not go together."""
+    """Raise ConfigError if `reconstruction.method` takes no images, or settings do not go together."""
     if config.reconstruction.method == "ply":
         raise ConfigError(
             "reconstruction.method is ply, mixtures from files: expected auto, rgbd or a network "
@@ -82,7 +82,7 @@ def scale_from(config: Config) -> str:
 
 
 def two_view_name(config: Config) -> str:
-    """The two-view network of the settings, and its weights, in words."""
+    """Describe the two-view network of the settings and its weights."""
     from garps_core.weights.store import default
 
     start = config.start
@@ -92,7 +92,7 @@ def two_view_name(config: Config) -> str:
 
 
 def load_networks(config: Config, say: Callable[[str], None], networks: Networks) -> None:
-    """Load the networks that the settings name, if any, into `networks`, and say what it took.
+    """Load the networks that the settings name, if any, into `networks`, and log the time that it took.
 
     Raises:
         WeightsError: weights that are not installed, or not what they should be.
@@ -120,7 +120,7 @@ def load_networks(config: Config, say: Callable[[str], None], networks: Networks
 
 
 def warm_up(config: Config, say: Callable[[str], None]) -> None:
-    """Align a tiny pair, so that what is compiled at first use, or read from where it was kept, is there.
+    """Align a tiny pair, so that loops are compiled or read from the cache before the first job.
 
     With numba the first time on a machine takes 10 to 20 s, the next 0.5 s.
     """

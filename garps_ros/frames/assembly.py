@@ -58,12 +58,12 @@ class Assembly:
         return self._all_framed(index, pairs or [])
 
     def settle(self) -> Complete:
-        """Return the pairs that wait for a better partner although nothing has come for a while."""
+        """Return the pairs that wait for a better partner when nothing has arrived for a while."""
         complete = [c for i, pairer in enumerate(self._with_depth) for c in self._all_framed(i, pairer.settle())]
         return complete + list(self._between.settle())
 
     def finish(self) -> Complete:
-        """Return the pairs that wait for a better partner, and drop the rest, because nothing will come any more."""
+        """Return the pairs that wait for a better partner, and drop the rest, at the end of the messages."""
         complete = [c for i, pairer in enumerate(self._with_depth) for c in self._all_framed(i, pairer.finish())]
         for index, waiting in enumerate(self._without_info):
             if waiting is not None:

@@ -84,10 +84,9 @@ def view_from_messages(
 
 
 def frame_warning(image: Any, info: Any, depth: Any = None) -> str:
-    """Say why calibration or depth may be another camera's, from their frame_id; "" when all name the image's.
+    """Return a warning that calibration or depth may be another camera's; "" when their frame_id is the image's.
 
-    It is no error, because some drivers are sloppy with frame_id. But wrong remapping looks the same, and gives wrong
-    poses.
+    It is no error, because some drivers set frame_id carelessly. Wrong remapping looks the same, but gives wrong poses.
     """
     frame_id = header_frame_id(image)
     warnings = []

@@ -7,7 +7,7 @@ from collections import deque
 from typing import Any
 
 MAX_WAITING, MAX_WAITING_LIVE = 60, 15
-"""Most items that wait for a partner. A camera's image and depth are several MB: live, half a second is enough."""
+"""Largest number of items that wait for a partner, offline and live; image and depth of a camera take several MB."""
 INTERVALS = 20
 ENOUGH_INTERVALS = 3
 

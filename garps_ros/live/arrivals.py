@@ -14,22 +14,22 @@ from garps_core.checks import Float64Array
 WINDOW = 100
 """Number of arrivals that statistics look back on."""
 MANY_MISSING = 0.3
-"""Share of missing messages from which on it is reported."""
+"""Smallest share of missing messages that is reported."""
 PAUSE_S = 5.0
-"""Gap of stamps that is a pause of the publisher and no loss, s."""
+"""Smallest gap of stamps that counts as a pause of the publisher and not as a loss, s."""
 NEAR = 0.25
 """Distance from a whole number of periods, in periods, within which a gap counts as that number."""
 LONG = 3
-"""Number of periods above which a gap is a loss, however near it is to a whole number: jitter makes none so long."""
+"""Number of periods above which a gap is a loss, however near it is to a whole number; jitter is shorter."""
 STEADY = 6
-"""Number of equal gaps in a row that make a period of their own: chance loses messages less evenly."""
+"""Number of equal gaps in a row that count as a new period; random losses are less regular."""
 SURE_SIGMAS = 3.0
-"""Standard deviations by which the near gaps must outnumber those expected by chance, for a period to be found."""
+"""Standard deviations by which the near gaps must outnumber those expected by chance, for a period to be accepted."""
 SPREAD = 6.0
 """Ratio of the ninth to the first decile of the gaps that means loss even where no period is found."""
 ROUNDS = 20
 FEW = 20
-"""Number of messages below which nothing is said about loss."""
+"""Smallest number of messages from which loss is estimated."""
 
 
 class Arrivals:

@@ -11,9 +11,9 @@ from garps_ros.frames.frame import CameraTopics
 from msg_adapters import MessageError, header_stamp_ns
 
 JUMP_BACK_NS = 1_000_000_000
-"""Age against the newest stamp of its stream, ns, from which on a message is not late but time has jumped back."""
+"""Age of a message against the newest stamp of its stream, ns, that means a jump back in time."""
 STUBBORN = 10
-"""Number of older stamps in a row that also mean a jump back: the recording is shorter than `JUMP_BACK_NS`."""
+"""Number of older stamps in a row that also mean a jump back, for recordings shorter than `JUMP_BACK_NS`."""
 
 
 class Intake:

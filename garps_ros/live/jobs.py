@@ -73,7 +73,7 @@ class Job:
 
 @dataclass(eq=False)
 class Result:
-    """The outcomes of a job, and what is to be reported with them."""
+    """The outcomes of a job, with their report."""
 
     job: Job
     outcomes: list[Origin | Outcome] = field(default_factory=list)

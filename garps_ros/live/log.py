@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's log that writes each kind of warning at most every few seconds, so that none drowns the others."""
+"""A node's log that writes each kind of warning at most every few seconds, so that the others stay visible."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from garps_ros.live.worker import Worker
 from msg_adapters import NANOSECONDS, MessageError
 
 OFTEN_S = 0.2
-"""Period at which publishers are looked at and waiting frames are released, s."""
+"""Period at which publishers are checked and waiting frames are released, s."""
 STALE = "stale: reset or settings changed"
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False)
 
@@ -52,7 +52,7 @@ class PoseNode:
 
     def __init__(self, node: Node) -> None:
         self.start_error = ""
-        """Error for which it cannot become ready and the process must end; "" = none."""
+        """Error because of which the node cannot become ready and the process must end; "" = none."""
         self._node, self._log, self._is_ready = node, Log(node.get_logger()), False
         self._counts, self._priors = Counts(), Priors()
         self._diagnostics = Diagnostics(self._counts)
@@ -193,7 +193,7 @@ class PoseNode:
         return round(self._parameters.node.sync_slop * NANOSECONDS)
 
     def _settings_changed(self) -> None:
-        """Drop results of other settings where those decide; forget a keyframe that was read by other settings."""
+        """Drop results whose settings have changed; forget a keyframe that was read by other settings."""
         before, self._decisive = self._decisive, decisive_settings(self._parameters.node, self._parameters.config)
         if before[0] != self._decisive[0]:
             self._epoch += 1

@@ -33,7 +33,7 @@ Type = rclpy.parameter.Parameter.Type
 TYPES = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}
 OUR_PREFIXES = tuple(f"{part}." for part in PARTS)
 ALIKE = 0.83
-"""Names at least this similar to one of ours are taken for a typo; `max_range` (0.82) is not."""
+"""Smallest similarity (0..1) to a parameter's name that counts as a typo; `max_range` has 0.82."""
 
 
 class NodeParameters:
@@ -79,7 +79,7 @@ class NodeParameters:
         return {change.name: change.value for change in changes if change.name in self._values}
 
     def _judge(self, changes: list[rclpy.parameter.Parameter]) -> SetParametersResult:
-        """Check the settings as they would be; changes nothing. The reason of a refusal reaches whoever asked."""
+        """Check the settings as they would be; changes nothing. The caller receives the reason of a refusal."""
         ours = self._ours(changes)
         try:
             if ours:
@@ -186,7 +186,7 @@ def _start_value(parameter: Parameter, overrides: Mapping[str, rclpy.parameter.P
         return given.value
     word = given.type_.name.lower().replace("_", " ")
     raise ConfigError(
-        f"{parameter.name} is {given.value!r:.100} ({word}): expected {_an(expected.name.lower())}; "
+        f"{parameter.name} is {given.value!r:.100} ({word}): expected {_an(expected.name.lower())}"
         + _advice(given.value, parameter.default)
     )
 
@@ -196,12 +196,12 @@ def _an(word: str) -> str:
 
 
 def _advice(value: Any, default: Any) -> str:
-    """Return how to write the value so that it has the type of the default, or the default as an example."""
+    """Return the end of the error text: the value in the type of the default, or the default as an example."""
     if isinstance(default, str) and isinstance(value, (bool, int, float)):
         quoted = json.dumps(str(value).lower())
-        return f"write {quoted} in a file, '{quoted}' in a shell"
+        return f". Write {quoted} in a file, '{quoted}' in a shell"
     if isinstance(default, float) and type(value) is int:
-        return f"write {float(value)}"
+        return f". Write {float(value)}"
     if type(default) is int and isinstance(value, float) and value.is_integer():
-        return f"write {int(value)}"
-    return f"for example {json.dumps(default)}"
+        return f". Write {int(value)}"
+    return f", for example {json.dumps(default)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions whose QoS suits their publishers, and which know why nothing arrives. Callbacks store references only.
+"""Subscriptions whose QoS suits their publishers, with the reason why nothing arrives. Callbacks only store references.
 
 Images are subscribed as best effort while they get through, and as reliable when they do not: beyond 0.5 MB Fast DDS
 loses most of them in its default setting. Reliable is not for all: Fast DDS 2.14 can loop for ever in a reliable reader
@@ -21,7 +21,7 @@ from garps_ros.live.arrivals import MANY_MISSING, Arrivals, InputState
 QUEUE = 10
 """Number of messages that wait for the executor; a third of a second at 30 Hz."""
 NOTHING_S = 3.0
-"""Time without any message from publishers that are there after which messages count as lost, s."""
+"""Time without a message from an existing publisher after which messages count as lost, s."""
 
 
 class Input:
@@ -129,8 +129,8 @@ class Input:
         if not others or len(others) < len(offers):
             return ""
         return (
-            f"{others[0].node_name} publishes {others[0].topic_type}, expected {wanted}; "
-            "check the remapping, image_transport and depth_transport"
+            f"{others[0].node_name} publishes {others[0].topic_type}, expected {wanted}. "
+            "Check the remapping, image_transport and depth_transport"
         )
 
 

@@ -56,7 +56,7 @@ class Transforms:
     def _objection(self, frame_id: str, child: str) -> str:
         """Return why the transform would break the tree; "" when it would not.
 
-        A parent of the same name is no better than another one: two answers to where the child is.
+        A parent of the same name breaks it too, because the child would have two poses.
         """
         parent = self._parents.get(child)
         if parent is not None:

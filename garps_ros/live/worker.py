@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread that computes, fed through a slot that holds the newest job only: never behind, never blocking."""
+"""One worker thread, fed through a slot that holds only the newest job, so that callers never wait for it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Worker(Generic[Job, Result]):
 
     Args:
         compute: from a job to its result; runs in the thread. Expected failures are results, not exceptions: one
-            that escapes ends the thread, which `death` then says; `restart` begins a new one.
+            that escapes ends the thread and is described by `death`; `restart` begins a new one.
         finished: called in the thread when a result is ready to be taken, or when prepared; must not raise.
         prepare: called in the thread before the first job, once, whatever comes of it.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes docs/parameters.md and config/garps.yaml from the parameters themselves.
 
-`python -m garps_ros.parameters.docs` writes both, `--check` only says (exit code 1) whether one of them is stale.
+`python -m garps_ros.parameters.docs` writes both; `--check` writes nothing, and exits with 1 if one of them is stale.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GROUPS = {
 OTHER_PRESETS = tuple(name for name in PRESETS if name not in ("default", "sensor"))
 INDENT = " " * 4
 WIDTH = 120
-"""Longest line of config/garps.yaml."""
+"""Longest line of config/garps.yaml, characters."""
 
 INTRODUCTION = """\
 # Parameters of the live node

@@ -11,9 +11,9 @@ from garps_core.config.renamed import warn_once
 from garps_core.errors import ConfigError
 
 RECTIFIED = ("auto", "rectified", "raw")
-"""Answers to whether images are rectified."""
+"""Values of the setting `rectified`."""
 OLD_RECTIFIED = {"true": "rectified", "false": "raw"}
-"""Earlier words for the same, which work for one release."""
+"""Earlier values of `rectified`, which work for one release."""
 
 
 def current_rectified(value: str) -> str:

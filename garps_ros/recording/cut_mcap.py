@@ -53,7 +53,7 @@ def _has_end(file: BinaryIO, size: int) -> bool:
 
 
 class CutMcap:
-    """A path to the first `end` bytes of an MCAP file followed by a footer; has what rosbags asks of a path.
+    """A path to the first `end` bytes of an MCAP file followed by a footer, with the methods that rosbags calls.
 
     Args:
         path: the file that was cut off.

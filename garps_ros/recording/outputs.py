@@ -57,7 +57,7 @@ class Outputs:
             self._bag = self._stack.enter_context(writer)
         except OSError as error:
             self._stack.close()
-            raise BagError(f"cannot write to {folder}: {error.strerror or error}; give another --out") from None
+            raise BagError(f"cannot write to {folder}: {error.strerror or error}. Give another --out") from None
         self._connections = {
             topic: self._bag.add_connection(topic, kind, typestore=store) for topic, kind in TOPICS.items()
         }
@@ -117,7 +117,7 @@ class Outputs:
 
     def _prepare(self, overwrite: bool) -> None:
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())) and not overwrite:
-            raise BagError(f"{self.folder} exists and is not empty: expected a new folder; give another or --overwrite")
+            raise BagError(f"{self.folder} exists and is not empty: expected a new folder. Give another or --overwrite")
         self.folder.mkdir(parents=True, exist_ok=True)
         for old in (*self.folder.glob("trajectory*.tum"), self.folder / CSV_FILE):
             old.unlink(missing_ok=True)

@@ -39,12 +39,12 @@ TICK_S = 0.008
 LEAD_S = 0.1
 """Wall time that /clock runs before the first message, s."""
 LATE_S = 0.2
-"""Wall time behind the recording from which on a line is written, s."""
+"""Lag of the playback behind the recording beyond which a line is printed, s."""
 SETTLE_S = 0.6
 """Time without a new subscription after which the listeners count as complete, s: they are matched one after another,
 and `pose_node`, which looks at the publishers every 0.2 s, then subscribes anew with the QoS that they offer."""
 PATIENCE_S = 3.0
-"""That time while the graph shows more subscriptions than are matched, s; some never are, because of their QoS."""
+"""Time that replaces `SETTLE_S` while the graph shows unmatched subscriptions, s; wrong QoS is never matched."""
 DELIVERY_S = 5.0
 """Time that slow subscribers may take to acknowledge the last messages, s."""
 
@@ -101,7 +101,7 @@ def _node() -> Iterator[Node]:
     except RuntimeError as error:  # what rcl's errors are
         context.try_shutdown()
         raise BagError(
-            f"ROS 2 does not start: {' '.join(str(error).split())}; see ROS_DOMAIN_ID and its like"
+            f"ROS 2 does not start: {' '.join(str(error).split())}. See ROS_DOMAIN_ID and its like"
         ) from None
     try:
         yield node

@@ -38,7 +38,7 @@ class RawBag(Bag):
         return int(self._reader.end_time or 0)
 
     def latched(self, topic: str) -> int:
-        """Return the number of messages of a topic that late subscribers got when it was recorded."""
+        """Return the number of messages of a topic that its recorded publisher kept for late subscribers."""
         count = 0
         for connection in self._reader.connections:
             if connection.topic != topic:

@@ -50,7 +50,7 @@ class Route:
     def send(self, raw: bytes | MessageError) -> None:
         """Publish a serialised message, or count it as refused.
 
-        Messages are looked at until one fits the installed type: definitions change between distributions (Range and
+        Messages are decoded until one fits the installed type: definitions change between distributions (Range and
         BatteryState did after ROS 1), and a subscriber takes the wrong one for garbage, or ends.
         """
         misfit = str(raw) if isinstance(raw, MessageError) else "" if self.fits else self._misfit(raw)
@@ -81,7 +81,7 @@ class Route:
 
 
 def open_routes(node: Node, bag: RawBag, topics: list[str]) -> tuple[dict[str, Route], dict[str, str]]:
-    """Open publishers of the topics that can be played; return also why the others cannot.
+    """Open publishers of the topics that can be played; return also the reasons why the others cannot.
 
     Args:
         node: the publishers' node.

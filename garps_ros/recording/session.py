@@ -56,7 +56,7 @@ def _write(outcome: Outcome, outputs: Outputs, summary: Summary) -> None:
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
     """Make SIGINT and SIGTERM only set the value of the function that is given, so that no row is left half written.
 
-    A second signal does what it would have done: whoever insists does not wait for the pair at hand.
+    A second signal has its default effect, so that a user can end the process without waiting for the current pair.
     """
     received: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -87,8 +87,8 @@ def _completed(
         raise BagError(f"no camera_info found for {camera.image}: give --{name}-info; topics: {bag.listing()}")
     if depth and not camera.depth:
         raise BagError(
-            f"no depth found for {camera.image}: expected depth of every camera, registered to its image; "
-            f"give --{name}-depth, {WITHOUT_DEPTH}; topics: {bag.listing()}"
+            f"no depth found for {camera.image}: expected depth of every camera, registered to its image. "
+            f"Give --{name}-depth, {WITHOUT_DEPTH}; topics: {bag.listing()}"
         )
     return camera
 

@@ -60,7 +60,7 @@ INDEFINITE = changed(np.eye(6), (0, 1), 2) + changed(np.zeros((6, 6)), (1, 0), 2
 VIEWS = {
     "rgb list": (lambda: view(rgb=[[0, 0, 0]]), "rgb is list: expected an HxWx3 uint8 array"),
     "rgb float": (lambda: view(rgb=RGB / 255), "rgb is dtype float64: expected an HxWx3 uint8 array, values 0..255"),
-    "rgb grey": (lambda: view(rgb=RGB[..., 0]), r"shape \(48, 64\): expected HxWx3; repeat a grey image over three"),
+    "rgb grey": (lambda: view(rgb=RGB[..., 0]), r"shape \(48, 64\): expected HxWx3. Repeat a grey image over three"),
     "rgb with alpha": (lambda: view(rgb=np.zeros((48, 64, 4), np.uint8)), r"shape \(48, 64, 4\): expected HxWx3"),
     "rgb planes first": (lambda: view(rgb=np.zeros((3, 48, 64), np.uint8)), r"shape \(3, 48, 64\): expected HxWx3"),
     "rgb tiny": (lambda: view(rgb=RGB[:15]), "rgb is 64x15: expected at least 16x16"),
@@ -76,7 +76,7 @@ VIEWS = {
     "K infinite": (lambda: view(K=changed(K, (0, 0), np.inf)), "K holds NaN or infinity: expected finite"),
     "K zeros": (lambda: view(K=np.zeros((3, 3))), "fx=0, fy=0: expected both positive, .* calibrate it first"),
     "K negative focal": (lambda: view(K=changed(K, (1, 1), -50)), "fx=50, fy=-50: expected both positive"),
-    "K transposed": (lambda: view(K=K.T), r"last row \[32.0, 24.0, 1.0\]: expected \[0, 0, 1\].* is it transposed"),
+    "K transposed": (lambda: view(K=K.T), r"last row \[32.0, 24.0, 1.0\]: expected \[0, 0, 1\].* Is it transposed"),
     "K skew": (lambda: view(K=changed(K, (0, 1), 0.5)), "K has skew 0.5: expected 0; rectify the image first"),
     "K scaled": (lambda: view(K=2 * K), r"last row \[0.0, 0.0, 2.0\]: expected \[0, 0, 1\]"),
     "depth uint16": (
@@ -90,7 +90,7 @@ VIEWS = {
     "depth with channel": (lambda: view(depth=DEPTH[..., None]), "depth is 48x64x1 but rgb is 48x64"),
     "depth negative": (lambda: view(depth=-DEPTH), "depth holds negative values: expected metres along z"),
     "depth millimetres": (lambda: view(depth=DEPTH * 1000), "median 2000 m: .*millimetres; expected .* by 0.001"),
-    "depth kilometres": (lambda: view(depth=DEPTH / 1000), "median 0.002 m: expected metres; is it a disparity"),
+    "depth kilometres": (lambda: view(depth=DEPTH / 1000), "median 0.002 m: expected metres. Is it a disparity"),
 }
 
 PRIORS = {
@@ -109,7 +109,7 @@ PRIORS = {
     "covariance diagonal only": (lambda: Prior(np.eye(4), np.ones(6)), r"has shape \(6,\): expected 6x6"),
     "covariance zero": (
         lambda: Prior(np.eye(4), np.zeros((6, 6))),
-        "not positive definite: .* zeros do not mean unknown; give every direction a positive variance",
+        "not positive definite: .* zeros do not mean unknown. Give every direction a positive variance",
     ),
     "covariance indefinite": (lambda: Prior(np.eye(4), INDEFINITE), "not positive definite: smallest eigenvalue -1"),
     "covariance asymmetric": (
@@ -117,7 +117,7 @@ PRIORS = {
         "not symmetric: largest difference 0.5, expected 0",
     ),
     "covariance NaN": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.nan)), "NaN or infinity: expected finite var"),
-    "covariance infinite": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.inf)), "use a large one for unknown"),
+    "covariance infinite": (lambda: Prior(np.eye(4), changed(FREE, (2, 2), np.inf)), "Use a large one for unknown"),
 }
 
 MIXTURES = {
@@ -142,7 +142,7 @@ MIXTURES = {
     ),
     "covariance indefinite": (
         lambda: mixture(covariances=changed(GOOD.covariances, 7, np.diag([1, 1, -1]))),
-        r"component 7 has eigenvalue -1 m\^2; expected positive definite; add a small variance",
+        r"component 7 has eigenvalue -1 m\^2: expected positive definite. Add a small variance",
     ),
     "covariance asymmetric": (
         lambda: mixture(covariances=changed(GOOD.covariances, (7, 0, 1), 9)),
@@ -153,7 +153,7 @@ MIXTURES = {
     "labels short": (lambda: mixture(labels=np.ones(3, int)), r"labels have shape \(3,\), int64: expected 60 integers"),
     "49 components": (
         lambda: align_mixtures(GOOD, random_mixture(0, 49), PRIOR),
-        "target has 49 components: expected at least 50; use a smaller stride",
+        "target has 49 components: expected at least 50. Use a smaller stride",
     ),
     "no components": (
         lambda: align_mixtures(random_mixture(0, 0), GOOD, PRIOR),
@@ -202,7 +202,7 @@ SETTINGS = {
     "ladder list": (lambda: Alignment(ladder=[Rung()]), "alignment.ladder is .*: expected a tuple"),
     "no such device": (
         lambda: align_mixtures(GOOD, GOOD, PRIOR, Config(device="nonsense")),
-        "device is 'nonsense', which is not there: expected one of cpu.*; set device to 'cpu'",
+        "device is 'nonsense', which is not there: expected one of cpu.*. Set device to 'cpu'",
     ),
     "no such device number": (
         lambda: align_mixtures(GOOD, GOOD, PRIOR, Config(device="cuda:99")),
@@ -214,14 +214,14 @@ SETTINGS = {
     ),
     "device of the whole pipeline": (
         lambda: estimate_relative_pose(view(), view(), Config(device="nonsense")),
-        "device is 'nonsense', which is not there: expected one of cpu.*; set device to 'cpu'",
+        "device is 'nonsense', which is not there: expected one of cpu.*. Set device to 'cpu'",
     ),
 }
 
 WITHOUT_DEPTH = {
     "no depth": (
         lambda: reconstruct(view(depth=None)),
-        r"the view has no depth: expected .*; give View\(\.\.\., depth=",
+        r"the view has no depth: expected .*. Give View\(\.\.\., depth=",
     ),
     "pipeline, source": (lambda: estimate_relative_pose(view(depth=None), view()), "the view has no depth: expected"),
     "pipeline, target": (lambda: estimate_relative_pose(view(), view(depth=None)), "the view has no depth: expected"),
@@ -230,13 +230,13 @@ WITHOUT_DEPTH = {
 RECONSTRUCTIONS = {
     "all NaN": (
         lambda: reconstruct(view(depth=DEPTH * np.nan)),
-        r"0 usable depth pixels of 3072 \(0 with a reading\): expected at least 50; check",
+        r"0 usable depth pixels of 3072 \(0 with a reading\): expected at least 50. Check",
     ),
     "all zero": (lambda: reconstruct(view(depth=DEPTH * 0)), r"\(0 with a reading\): expected at least 50"),
     "40 pixels": (lambda: reconstruct(few_readings(20)), r"40 with a reading|120 with a reading"),
     "out of range": (
         lambda: reconstruct(view(depth=DEPTH * 20)),
-        r"0 usable depth pixels of 3072 \(3072 with a reading\): expected at least 50; check range limits",
+        r"0 usable depth pixels of 3072 \(3072 with a reading\): expected at least 50. Check range limits",
     ),
     "one edge": (
         lambda: reconstruct(view(depth=np.where(np.arange(64) % 2, 2, 4) * np.ones((48, 1), np.float32))),

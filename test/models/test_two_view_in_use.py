@@ -288,7 +288,7 @@ def test_what_is_not_installed_is_said_with_what_to_type(
 def test_a_picture_that_is_too_long_is_said(files: Files, tmp_path: Path, capsys: Captured) -> None:
     long = {**files, "a": files["a_long"]}
     for words in ([*K_WORDS, "--preset", "mast3r"], ["--preset", "mast3r"]):
-        assert "160x17 pixels: expected at least 16x16, and at most 8 to 1; crop" in refused(capsys, long, *words)
+        assert "160x17 pixels: expected at least 16x16, and at most 8 to 1. Crop" in refused(capsys, long, *words)
 
 
 class Hostile:

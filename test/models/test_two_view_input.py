@@ -115,8 +115,8 @@ def test_the_framing_says_where_a_pixel_went() -> None:
 BAD = {
     "smaller than a patch": (np.zeros((15, 80, 3), np.uint8), "80x15 pixels: expected at least 16x16"),
     "empty": (np.zeros((0, 80, 3), np.uint8), "80x0 pixels: expected at least 16x16"),
-    "a line": (np.zeros((20, 161, 3), np.uint8), "161x20 pixels: .* at most 8 to 1; crop"),
-    "a column": (np.zeros((161, 20, 3), np.uint8), "20x161 pixels: .* at most 8 to 1; crop"),
+    "a line": (np.zeros((20, 161, 3), np.uint8), "161x20 pixels: .* at most 8 to 1. Crop"),
+    "a column": (np.zeros((161, 20, 3), np.uint8), "20x161 pixels: .* at most 8 to 1. Crop"),
     "float": (np.zeros((60, 80, 3), np.float32), "float32.*HxWx3 uint8"),
     "grey": (np.zeros((60, 80), np.uint8), r"uint8 \(60, 80\).*HxWx3"),
 }

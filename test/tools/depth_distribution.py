@@ -45,7 +45,7 @@ unknown = failing(lambda views: [np.full(view.rgb.shape[:2], np.nan, np.float32)
 """
 FAILING = {
     "raising": "failed: KeyError: 0",
-    "too_few": "returned 0 maps for 2 views",
+    "too_few": "returned 0 maps: expected 2",
     "misshapen": "returned float32 (2, 3): expected an array float32 (240, 320), metres",
     "doubles": "returned float64 (240, 320): expected an array float32 (240, 320), metres",
     "lists": "returned list: expected an array float32 (240, 320), metres",

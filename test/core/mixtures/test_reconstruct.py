@@ -251,7 +251,7 @@ def test_the_smallest_view_has_depth_and_a_strip_is_refused() -> None:
         reconstruction.reconstruct(small, MONOCULAR.replace({"lifting.stride": 4}))
     for size in ((16, 2000), (2000, 16)):
         strip = View(np.zeros((*size, 3), np.uint8), K)
-        with pytest.raises(InputError, match=rf"{size[1]}x{size[0]} pixels.*crop the image"):
+        with pytest.raises(InputError, match=rf"{size[1]}x{size[0]} pixels.*Crop the image"):
             estimate_relative_pose(strip, strip, MONOCULAR)
 
 

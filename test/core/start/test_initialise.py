@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The initial pose: features and metric PnP where there is texture, and an honest fallback where there is none."""
+"""The start pose: features and metric PnP where there is texture, and an honest fallback where there is none."""
 
 from dataclasses import replace
 
@@ -342,7 +342,7 @@ def test_measurements_that_contradict_each_other_are_two_starts():
     np.testing.assert_allclose(features.T_target_source, TRUTH, atol=1e-15)
 
 
-def test_features_sharpen_a_given_prior_or_contradict_it():
+def test_features_refine_a_given_prior_or_contradict_it():
     source, target, truth = room(1, 2)
     (features,) = initialise(source, target)
     (both,) = initialise(source, target, None, disturbed(truth))
