@@ -39,9 +39,6 @@ Four = tuple[float, float, float, float]
 Settings = Annotated[
     Path | None, typer.Option(help="YAML file of settings; --preset and --set stand above it.", metavar="FILE")
 ]
-Pose = Annotated[
-    str | None, typer.Option(help="Start pose T_target_source, m and quaternion.", metavar='"X Y Z QX QY QZ QW"')
-]
 Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a setting; may be repeated.", metavar="NAME=VALUE"),
