@@ -174,7 +174,7 @@ def test_a_pair_without_depth_is_failures(folder: Path) -> None:
     pair = read_pairs("rooms", folder, 1)[0]
     narrow = View(np.zeros((480, 32, 3), np.uint8), pair.source.K)
     job = run.Job("demo_net", ("none", "features"), replace(pair, source=narrow), Config(), ("garps", "sift-pnp"), 0)
-    made = run.rows_of(job)
+    made = run.job_rows(job)
     assert [[row["method"] for row in rows] for rows in made] == [["(start)", "garps", "sift-pnp"]] * 2
     assert all(not row["found"] and row["reason"].startswith("no depth: ") for rows in made for row in rows)
 

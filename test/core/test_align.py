@@ -18,6 +18,7 @@ from garps_core.start.initialise import initialise
 PUBLIC = {
     "Config": ["reconstruction", "lifting", "start", "alignment", "paper", "method", "device", "dtype", "seed"],
     "ConfigError": None,
+    "Estimator": ["config", "networks"],
     "GarpsError": None,
     "InputError": None,
     "Mixture": ["means", "covariances", "weights", "colours", "labels", "frustum"],
