@@ -67,7 +67,7 @@ def test_metres_of_a_network_are_named_and_reach_the_rows(clips: Path, tmp_path:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--depth", "guess"], "--depth is 'guess', --scale 'raw': expected one of demo_net"),
+        (["--depth", "guess"], "--depth is 'guess', --scale 'raw': expected one of depth_anything_v2, demo_net"),
         (["--scale", "feet"], "scale is 'feet': expected one of raw, sfm-depth"),
         (["--scale", "raw:x"], "scale is 'raw:x': expected one of raw, sfm-depth"),
         (["--split", "all"], "split is 'all': expected one of test, validation"),

@@ -255,8 +255,8 @@ BAD_IMAGES = {
     "no array": ([[1]], "list.*HxWx3"),
     "empty": (np.zeros((0, 80, 3), np.uint8), "80x0 pixels: expected at least 14x14"),
     "smaller than a patch": (np.zeros((13, 80, 3), np.uint8), "80x13 pixels: expected at least 14x14"),
-    "a line": (np.zeros((14, 4000, 3), np.uint8), "4000x14 .*147994x518.*4144.*crop"),
-    "a column": (np.zeros((4000, 400, 3), np.uint8), "400x4000 .*518x5180.*crop"),
+    "a line": (np.zeros((14, 4000, 3), np.uint8), "4000x14 .*147994x518.*4144.*Crop"),
+    "a column": (np.zeros((4000, 400, 3), np.uint8), "400x4000 .*518x5180.*Crop"),
 }
 
 
