@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 from clips import HEIGHT, WIDTH, motion, track_line, write_frames, write_sparse, write_track
+from places import DATA
 
 from bench.pairs.pair import rng_of
-from bench.pairs.readers import READERS, MissingFiles, load, pair_list, realestate10k, sfm_scale
+from bench.pairs.readers import READERS, MissingFiles, load, pair_list, pairs_json, realestate10k, sfm_scale
 from bench.pairs.readers.dataset_files import arrays, category_of, chosen, frame_gaps, inside, rows, text_of
 from garps_core.geometry import project, transform
 
@@ -326,3 +327,8 @@ def test_small_helpers(tmp_path):
     with pytest.raises(ValueError, match="gap is 0"):
         frame_gaps({"a": 3}, 0)
     assert inside(tmp_path, "a/b.png", "here") == tmp_path / "a" / "b.png"
+
+
+def test_recorded_pairs_are_looked_for_beside_the_checkout():
+    """Where there are none, a run by default leaves them out, so a wrong folder would go unnoticed."""
+    assert pairs_json.DATA == DATA

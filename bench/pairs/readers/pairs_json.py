@@ -19,7 +19,7 @@ from bench.pairs.pair import Pair, evenly, scene_points
 from garps_core.checks import Float32Array, Float64Array, checked_rigid
 from garps_core.types import View
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 HALVES = ("all", "dev", "held-out")
 """Parameters are chosen on the first half, figures reported on the other."""
 RGBD_SETS = ("hololens_lounge", "tum_fr1_rpy")
