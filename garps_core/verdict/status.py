@@ -43,7 +43,7 @@ def verdict(
             Status.INCONSISTENT,
             f"the views pull {distance:.1f} sigmas away from the start ({settings.max_prior_sigmas:g} allowed)",
         )
-    weakness = _weakness(candidate, guess, settings)
+    weakness = _missing_evidence(candidate, guess, settings)
     if weakness:
         return (
             Status.POOR_FIT,
@@ -70,7 +70,7 @@ def _sigmas_away(T: Float64Array, start: Prior) -> float:
     return float(np.sqrt(r @ np.linalg.solve(twist_from_ros(start.covariance, T0), r)))
 
 
-def _weakness(candidate: Candidate, guess: bool, settings: Alignment) -> str:
+def _missing_evidence(candidate: Candidate, guess: bool, settings: Alignment) -> str:
     """The evidence that is missing for the pose, or nothing."""
     brightness, support = candidate.brightness, candidate.solution.data.support
     wanted = settings.guess_support if guess and brightness is None else settings.min_support
