@@ -31,9 +31,9 @@ def initialise(
     """Return the poses to align from, each with its `origin` and `reason`.
 
     "auto" takes a given prior and features together. Without a prior it takes features; where features find no pose,
-    or `start.features` is off, the prior alone; and with neither the identity, if `start.identity_fallback`. "features" and "identity" ignore a prior. The pose of every
-    other method is combined with a given prior as that of features is. A prior and a start that contradict each other
-    are two start poses; the alignment decides between them.
+    or `start.features` is off, the prior alone; and with neither the identity, if `start.identity_fallback`.
+    "features" and "identity" ignore a prior. The pose of every other method is combined with a given prior as that of
+    features is. A prior and a start that contradict each other are two start poses; the alignment decides between them.
 
     Args:
         source, target: the pair.

@@ -150,7 +150,7 @@ LOOSE = Config().replace({"lifting.patch_sigma": 0.03, "start.ransac_px": 20.0})
 
 
 def test_features_that_leave_the_pose_open_do_not_keep_a_prior_from_its_turn(monkeypatch):
-    for seed in range(10):
+    for seed in range(2):
         matches = one_place(seed, pixel_noise=0.5, relative_depth_noise=0.1)
         monkeypatch.setattr(feature_start, "match_features", lambda *_, found=matches: found)
         assert initialise(BLANK, BLANK, LOOSE, disturbed())[0].origin == "given"
