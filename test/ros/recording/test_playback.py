@@ -94,7 +94,8 @@ class Listener(Peer):
         """Wait until the thread has made a condition true."""
         end = time.monotonic() + PATIENCE_S
         while not condition():
-            assert time.monotonic() < end
+            if time.monotonic() > end:
+                pytest.fail(f"the condition did not come true in {PATIENCE_S} s: the thread hangs")
             time.sleep(0.01)
 
     def __enter__(self):
