@@ -6,6 +6,7 @@ from garps_core.config import Config
 from garps_core.errors import ConfigError, GarpsError, InputError, ReconstructionError
 from garps_core.mixtures.reconstruct import reconstruct
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
+from garps_core.version import __version__ as __version__
 
 __all__ = [
     "Config",
@@ -23,4 +24,3 @@ __all__ = [
     "estimate_relative_pose",
     "reconstruct",
 ]
-__version__ = "0.1.0"

@@ -13,7 +13,6 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from garps_core import __version__
 from garps_core.align import Estimator, align_mixtures
 from garps_core.checks import Float64Array, checked_intrinsics
 from garps_core.cli.image_files import read_image, read_view
@@ -31,6 +30,7 @@ from garps_core.point_maps import PairMaps
 from garps_core.start.identity_start import identity
 from garps_core.start.intrinsics import intrinsics_of
 from garps_core.types import Mixture, PoseEstimate, Prior, Status, View
+from garps_core.version import __version__
 
 # typer 0.29 carries its own copy of click, older ones use the real one: BadParameter, UsageError, ClickException.
 ClickException: type[Exception] = typer.BadParameter.__mro__[2]

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 
-from garps_core import plugins
 from garps_core.config.field import Checked, setting
+from garps_core.plugins import installed_besides
 
 DEPTH_NETWORKS = {
     "depth_anything_v2": "garps_core.models.depth_anything:NETWORK",
@@ -36,7 +36,7 @@ def installed_depth_networks() -> dict[str, EntryPoint]:
 
     None can take a name that means something else already.
     """
-    return plugins.installed_besides(DEPTH_PLUGINS, frozenset((*_BEFORE, *DEPTH_NETWORKS, *_AFTER)))
+    return installed_besides(DEPTH_PLUGINS, frozenset((*_BEFORE, *DEPTH_NETWORKS, *_AFTER)))
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 
-from garps_core import plugins
 from garps_core.config.field import Checked, setting
+from garps_core.plugins import installed_besides
 
 TWO_VIEW = ("mast3r", "dust3r", "adapter")
 """Starts by a two-view network."""
@@ -31,7 +31,7 @@ def installed_starts() -> dict[str, EntryPoint]:
 
     None can take a name that means something else already; "given" is the origin of a prior.
     """
-    return plugins.installed_besides(START_PLUGINS, frozenset(("auto", "given", *STARTS)))
+    return installed_besides(START_PLUGINS, frozenset(("auto", "given", *STARTS)))
 
 
 @dataclass(frozen=True)
